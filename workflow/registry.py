@@ -81,7 +81,7 @@ STAGES: dict[str, Stage] = {
         Stage("shading", ("capture", "plan", "segmentation", "base", "emission"), ("shading", "seed")),
         Stage(
             "second_look",
-            ("capture", "segmentation", "shading"),
+            ("capture", "prior", "segmentation", "shading"),
             ("second_look", "prior", "segmentation.kind", "base", "seed"),
         ),
         Stage(

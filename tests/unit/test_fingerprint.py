@@ -142,7 +142,7 @@ def test_closure_covers_what_a_stage_really_imports(repository):
     )
     plugins = {
         "capture": ("source", ("builtin", "mitsuba", "folder", "scannetpp", "fipt")),
-        "prior": ("prior", ("learned", "simulated", "files", "retinex", "rgbx", "marigold")),
+        "prior": ("prior", ("learned", "simulated", "files", "retinex", "rgbx", "marigold", "pooled")),
         "segmentation": ("segmentation", ("given", "masks", "geometry")),
     }
     cases, roots = [], []

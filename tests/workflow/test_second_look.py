@@ -105,6 +105,33 @@ def test_the_fit_is_told_that_the_second_base_errs_less(lit, tmp_path):
     assert 0 < again.brightness < plain.brightness and again.level == plain.level and again.metal == plain.metal
 
 
+def test_predictions_that_are_pooled_with_the_learned_ones_stay(lit, tmp_path):
+    folder = copied(lit, tmp_path)
+    writer = StageWriter(folder / "prior", {"scene": "room", "stage": "prior", "fingerprint": "test"})
+    views = CaptureReader(StubJob("base", folder, {}).read("capture")).views
+    for view in views:
+        plain = np.full((view.height, view.width), 0.25, np.float16)
+        layers = [
+            {f"prior.{k:03d}.{name}": plain for name in ("albedo.R", "albedo.G", "albedo.B", "roughness", "metallic")}
+            for k in range(3)
+        ]
+        writer.exr(f"maps/{view.name}.exr", {name: values for layer in layers for name, values in layer.items()})
+    ids = [view.view_id for view in views]
+    writer.table(
+        "predictions.parquet",
+        {"view_id": np.repeat(ids, 3).astype(np.int32), "k": np.tile(np.arange(3, dtype=np.int32), len(ids))},
+    )
+    writer.finish()
+    other = {"kind": "files", "samples": 1, "seed": None}
+    job = StubJob("second_look", folder, {"prior": {"kind": "pooled", "samples": 8, "seed": None, "of": [other, LEARNED]}})
+    found = second_look._Predictions(job, CaptureReader(job.read("capture")))
+    made = found.maps(views[0], 3)
+    assert found.samples == 3 and np.allclose(made[0], 0.25)
+    alone = second_look._Predictions(StubJob("second_look", folder, {"prior": LEARNED}), CaptureReader(job.read("capture")))
+    assert np.array_equal(made[1:], alone.maps(views[0], 2)) and np.ptp(made[1].astype(float)) > 0.1
+    assert np.array_equal(found.maps(views[0], 2), made[:2]) and np.array_equal(found.scale(views[0]), alone.scale(views[0]))
+
+
 def _learned_without_light(folder):
     """Predictions of the first look."""
     from workflow.priors import learned

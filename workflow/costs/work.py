@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from workflow.settings.prior import members, predictions
+
 MILLION = 1e6
 PASSES_OF_BASE = 10
 """Passes over the pixels that the published descent of the base makes where no number of steps is set."""
@@ -78,7 +80,7 @@ def _plan(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, flo
 
 def _prior(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     pixels = size.pixels / MILLION
-    return settings["prior"]["kind"], {"predictions": pixels * settings["prior"]["samples"], "pixels": pixels}
+    return settings["prior"]["kind"], {"predictions": pixels * predictions(settings["prior"]), "pixels": pixels}
 
 
 def _segmentation(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
@@ -87,8 +89,8 @@ def _segmentation(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[
 
 def _base(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     base, pixels, faces = settings["base"], size.pixels / MILLION, size.faces / MILLION
-    predictions = pixels * min(base["predictions"] or 1 << 30, settings["prior"]["samples"])
-    counts = {"predictions": predictions, "pixels": pixels, "faces": faces, "cells": _base_cells(settings, size)}
+    fused = pixels * min(base["predictions"] or 1 << 30, predictions(settings["prior"]))
+    counts = {"predictions": fused, "pixels": pixels, "faces": faces, "cells": _base_cells(settings, size)}
     if base["solver"] == "direct":
         return "direct", counts
     hashed = (base["texture"] or ("hashgrid" if base["preset"] == "paper" else "cells")) == "hashgrid"
@@ -140,7 +142,7 @@ def _shading(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, 
 
 
 def _second_look(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
-    if not settings["second_look"]["enabled"] or settings["prior"]["kind"] != "learned":
+    if not settings["second_look"]["enabled"] or all(one["kind"] != "learned" for one in members(settings["prior"])):
         return "none", {}
     kind, counts = _base(settings, size)
     del counts["predictions"]  # they lie on disk, and the network makes all of them whatever K is

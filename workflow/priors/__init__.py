@@ -49,6 +49,11 @@ class Predicted:
     scale: np.ndarray | None = None
 
 
+def members(prior: SimpleNamespace) -> list[SimpleNamespace]:
+    """Return the priors of a section `prior`: itself, or those that it pools, which lie there as plain values."""
+    return [SimpleNamespace(**own) for own in prior.of] if hasattr(prior, "of") else [prior]
+
+
 def predictor(
     settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep, threads: int = 1
 ) -> Callable[[View], Predicted]:

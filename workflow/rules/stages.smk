@@ -139,7 +139,7 @@ use rule stage as shading with:
 
 use rule stage as second_look with:
     input:
-        unpack(reads("second_look", "capture", "segmentation", "shading")),
+        unpack(reads("second_look", "capture", "prior", "segmentation", "shading")),
     pathvars:
         stage="second_look",
     resources:

@@ -208,7 +208,13 @@ def stage_modules(stage: str, settings: dict[str, Any]) -> list[str]:
 
 def _roots(stage: str, settings: dict[str, Any]) -> tuple[str, ...]:
     plugins = PLUGINS.get(stage, ())
-    return STAGES[stage].module, *(pattern.format(settings[section][key]) for section, key, pattern in plugins)
+    chosen = ((pattern, kind) for section, key, pattern in plugins for kind in _kinds(settings[section], key))
+    return STAGES[stage].module, *(pattern.format(kind) for pattern, kind in chosen)
+
+
+def _kinds(section: dict[str, Any], key: str) -> list[str]:
+    """Return what a section chooses, and what its members choose where it has any (`prior: {kind: pooled}`)."""
+    return [section[key], *(member[key] for member in section.get("of", ()))]
 
 
 def code_digest(stage: str, settings: dict[str, Any]) -> str:

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from workflow.intake.names import shown
 from workflow.settings.names import did_you_mean
-from workflow.settings.scene import UNIONS, SceneSettings, section_in
+from workflow.settings.scene import POOLED, UNIONS, SceneSettings, section_in
 from workflow.settings.section import Section
 
 NOT_READ = {
@@ -28,6 +28,7 @@ NEEDED = {
     **dict.fromkeys(("float_type", "float_parsing"), "Needed: a number"),
     **dict.fromkeys(("bool_type", "bool_parsing"), "Needed: true or false"),
     "finite_number": "Needed: a finite number",
+    "list_type": "Needed: a list",
 }
 """What a value of the wrong type should have been, by the type of pydantic's error."""
 BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
@@ -49,6 +50,8 @@ def _section_of(where: tuple[str | int, ...]) -> type[Section] | None:
             model = UNIONS[part]
         elif isinstance(model, dict):
             model = model.get(part, model)
+        elif model is UNIONS["prior"]["pooled"] and part == "of":
+            model = POOLED
         else:
             field = getattr(model, "model_fields", {}).get(part)
             model = section_in(field.annotation) if field else model
@@ -59,7 +62,8 @@ def _dotted(where: tuple[str | int, ...]) -> str:
     """Return the keys as they stand in the file (`prior.samples`), without pydantic's names of alternatives."""
     tags = {tag for union in UNIONS.values() for tag in union}
     parts = [str(part) for part in where]
-    return ".".join(p for i, p in enumerate(parts) if not (i == 1 and p in tags) and not _is_alternative(parts, i))
+    tagged = [i == 1 or parts[i - 1].isdigit() for i in range(len(parts))]
+    return ".".join(p for i, p in enumerate(parts) if not (tagged[i] and p in tags) and not _is_alternative(parts, i))
 
 
 def _is_alternative(parts: list[str], i: int) -> bool:
@@ -116,6 +120,8 @@ def needed(problem: Any) -> str:
         return NEEDED[problem["type"]]
     if bound is not None:
         return f"Needed: {bound}"
+    if problem["type"] == "too_short":
+        return f"Needed: at least {limits['min_length']} entries"
     if problem["type"] == "literal_error":
         return f"Allowed: {limits['expected']}"
     return problem["msg"].removeprefix("Value error, ")
@@ -144,7 +150,7 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
             example = EXAMPLES.get(str(where[0]), "config/scenes/kitchen.yaml")
             lines.append(f"{path}: `{dotted}`: missing. Add it; {example} is a complete example.")
         elif kind in ("union_tag_invalid", "union_tag_not_found"):
-            union = UNIONS.get(str(where[0]), {})
+            union = POOLED if "of" in where else UNIONS.get(str(where[0]), {})
             got = found.get("kind") if isinstance(found, dict) else found
             said = "missing. Add it;" if got is None else f"found {shown(got)},"
             hint = did_you_mean(got, union) if got is not None else ""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from workflow.settings.section import Section
 
@@ -107,9 +107,45 @@ class MarigoldPrior(DiffusionPrior):
     """Longest side in pixels to which photographs are scaled for the model; by default as the checkpoint recommends (768)."""
 
 
-Prior = Annotated[
+Member = Annotated[
     LearnedPrior | RetinexPrior | FilesPrior | RgbxPrior | MarigoldPrior | SimulatedPrior, Field(discriminator="kind")
 ]
+
+
+class PooledPrior(PriorBase):
+    """The predictions of several priors together; the fusion chooses among all of them (docs/guide/priors.md#pooled)."""
+
+    BY_VIEW: ClassVar[bool] = False
+    kind: Literal["pooled"]
+    samples: int = Field(8, ge=1, le=256)
+    """Predictions per photograph of each member that does not state its own number; K is the sum over the members."""
+    of: list[Member] = Field(min_length=2, max_length=8)
+    """The priors, each with the keys of its kind."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _samples_of_members(cls, value: Any) -> Any:
+        members = value.get("of") if isinstance(value, dict) else None
+        if not isinstance(members, list):
+            return value
+        common = {"samples": value["samples"]} if "samples" in value else {}
+        return {**value, "of": [{**common, **one} if isinstance(one, dict) else one for one in members]}
+
+
+Prior = Annotated[
+    LearnedPrior | RetinexPrior | FilesPrior | RgbxPrior | MarigoldPrior | SimulatedPrior | PooledPrior,
+    Field(discriminator="kind"),
+]
+
+
+def members(prior: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the priors of a dumped section `prior`: itself, or those that it pools."""
+    return prior.get("of", [prior])
+
+
+def predictions(prior: dict[str, Any]) -> int:
+    """Return K, the number of predictions per photograph that a dumped section `prior` makes."""
+    return sum(member["samples"] for member in members(prior))
 
 
 def by_view(kind: str) -> bool:

@@ -12,7 +12,7 @@ from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES, PUBLISH
 from workflow.settings.limits import Limits
 from workflow.settings.outputs import Export, Metrics, Relit, Render, Report, Room
 from workflow.settings.override import ByObject, Override
-from workflow.settings.prior import LearnedPrior, Prior
+from workflow.settings.prior import LearnedPrior, Member, Prior, predictions
 from workflow.settings.relight import Relightings, lamp_bases, recombines
 from workflow.settings.section import Section
 from workflow.settings.segmentation import GeometrySegmentation, Segmentation
@@ -75,10 +75,10 @@ class SceneSettings(Section):
 
     @model_validator(mode="after")
     def _known_predictions(self) -> SceneSettings:
-        made, used = getattr(self.prior, "samples", None), self.base.predictions
-        if made is not None and used is not None and used > made:
+        made, used = predictions(self.prior.model_dump()), self.base.predictions
+        if used is not None and used > made:
             raise ValueError(
-                f"`base: predictions` is {used}, but `prior: samples` makes {made}; lower the one or raise the other"
+                f"`base: predictions` is {used}, but `prior` makes {made} (`samples`); lower the one or raise the other"
             )
         return self
 
@@ -154,6 +154,8 @@ def _members(union: Any) -> dict[str, type[Section]]:
 
 UNIONS = {"source": _members(Source), "prior": _members(Prior), "segmentation": _members(Segmentation)}
 """Sections whose `kind` decides which other keys they have: section -> kind -> model."""
+POOLED = _members(Member)
+"""The same of the members of `prior: {kind: pooled}`."""
 
 SECTIONS_THAT_CHOOSE: dict[str, type[Section]] = {
     name: field.annotation

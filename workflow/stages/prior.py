@@ -14,7 +14,7 @@ from iif_core.numerics.parallel import map_in_order
 from iif_core.reflectance.material import PROPERTIES
 from workflow.artifacts.scratch import Scratch
 from workflow.artifacts.store import StageWriter, rgb, split_rgb
-from workflow.priors import Predicted, predictor
+from workflow.priors import Predicted, members, predictor
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.segmentations.surface import FOLDS
@@ -61,7 +61,7 @@ def predicted(job: Job, capture: CaptureReader, views: list[View]) -> list[Row]:
 
 def _written(job: Job, found: Predicted, view: View) -> list[Row]:
     """Write the maps of a view, and return its rows of predictions.parquet."""
-    maps, expected = found.maps, (job.settings.prior.samples, view.height, view.width, 5)
+    maps, expected = found.maps, (sum(own.samples for own in members(job.settings.prior)), view.height, view.width, 5)
     if maps.shape != expected:
         raise InputError(f"view {view.name}: the prior made {maps.shape}, needed {expected}; please report it")
     rows: list[Row] = []

@@ -40,6 +40,7 @@ from workflow.scene.base_scene import read_base
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import Recovered, read_recovered, response_samples
 from workflow.settings import active_plan
+from workflow.settings.prior import members
 from workflow.stages import publish
 
 PLAN_KEYS = (
@@ -301,11 +302,17 @@ def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple
             f"{number(len(recovered.surface.cell_ijk))} of {1000 * recovered.surface.cell_edge:.1f} mm,"
             f" {100 * job.read('base').json('base.json')['seen_once_share']:.0f} % in one photograph only",
         ),
-        ("prior", f"{prior.get('kind', 'unknown')}, {prior.get('samples', '?')} predictions a photograph"),
+        ("prior", _prior_fact(prior)),
     ]
     if held_out:
         facts.insert(3, ("held out", f"{held_out} photographs were not used"))
     return facts
+
+
+def _prior_fact(prior: dict[str, Any]) -> str:
+    """Return kind and number of the predictions; of pooled ones, of each member."""
+    own = members(prior) if prior else []
+    return ", ".join(f"{one['kind']}, {one['samples']} predictions a photograph" for one in own) or "unknown"
 
 
 def _objects_fact(job: Job, count: int) -> str:

@@ -8,20 +8,21 @@ import numpy as np
 
 from iif_core.numerics.parallel import map_in_order
 from workflow.artifacts.scratch import Scratch
-from workflow.priors import learned
+from workflow.priors import learned, members
+from workflow.priors.pooled import member_settings
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import SECOND_LOOK
 from workflow.scene.cached_light import read_diffuse
 from workflow.scene.normal_form import CaptureReader, View
-from workflow.stages.base import fuse
+from workflow.stages.base import StoredPredictions, fuse
 
 
 def run(job: Job) -> None:
     """Write second_look.json and, with prior `learned`, everything that stage base writes, from new predictions. The predictions
     themselves are not kept."""
-    kind = job.settings.prior.kind
-    if kind != "learned" or not job.settings.second_look.enabled:
-        why = "second_look: {enabled: false}" if kind == "learned" else f"prior {kind} does not use the light"
+    kinds = [own.kind for own in members(job.settings.prior)]
+    if "learned" not in kinds or not job.settings.second_look.enabled:
+        why = "second_look: {enabled: false}" if "learned" in kinds else f"prior {' and '.join(kinds)} does not use the light"
         job.writer.json(SECOND_LOOK, {"made": False, "reason": why})
         return
     capture = CaptureReader(job.read("capture"))
@@ -33,16 +34,24 @@ def run(job: Job) -> None:
 
 
 class _Predictions:
-    """New predictions of every view, kept in a scratch file while the job runs."""
+    """New predictions of every view, kept in a scratch file while the job runs; those of other priors that are pooled with them
+    are those of stage prior."""
 
     def __init__(self, job: Job, capture: CaptureReader):
-        self.samples = job.settings.prior.samples
-        seed = job.seed if job.settings.prior.seed is None else job.settings.prior.seed
+        pool = members(job.settings.prior)
+        place = [one.kind for one in pool].index("learned")
+        own = pool[place]
+        self.samples = sum(one.samples for one in pool)
+        first = sum(one.samples for one in pool[:place])
+        self._new = slice(first, first + own.samples)
+        self._first = StoredPredictions(job.read("prior")) if len(pool) > 1 else None
+        seed = job.seed if own.seed is None else own.seed
         views = capture.used
         # What the network needs of the views goes to a file of its own, which ends with the network.
         gathered = Scratch(job.writer.directory)
+        settings = member_settings(job.settings, own)
         predict = learned.prepare(
-            job.settings, capture, seed, gathered, job.threads, light=lambda view: read_diffuse(job, view).mean(0)
+            settings, capture, seed, gathered, job.threads, light=lambda view: read_diffuse(job, view).mean(0)
         )
         keep = Scratch(job.writer.directory)
         self._of: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
@@ -56,7 +65,12 @@ class _Predictions:
         return view.view_id in self._of
 
     def maps(self, view: View, samples: int) -> np.ndarray:
-        return self._of[view.view_id][0][:samples]
+        new = self._of[view.view_id][0]
+        if self._first is None:
+            return new[:samples]
+        out = self._first.maps(view, self.samples)
+        out[self._new] = new
+        return out[:samples]
 
     def scale(self, view: View) -> np.ndarray | None:
         return self._of[view.view_id][1]
