@@ -60,6 +60,9 @@ compare/%: setup always
 score/%: setup always
 	$(SNAKEMAKE) --cores $(CORES) $@ --config quality=$(or $(QUALITY),draft) $(if $(MAPS),maps=$(MAPS)) $(SNAKEMAKE_ARGS)
 
+results/studies/%: setup always
+	$(SNAKEMAKE) -s lab/Snakefile --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
+
 results/%: setup always
 	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
 
@@ -120,11 +123,11 @@ doctor:
 lint: setup
 	$(PYTHON_BIN) -m ruff check .
 	.venv/bin/lint-imports
-	$(PYTHON_BIN) -m snakefmt --check Snakefile workflow/rules
+	$(PYTHON_BIN) -m snakefmt --check Snakefile workflow/rules lab/Snakefile lab/rules
 
 format: setup
 	$(PYTHON_BIN) -m ruff check --fix .
-	$(PYTHON_BIN) -m snakefmt Snakefile workflow/rules
+	$(PYTHON_BIN) -m snakefmt Snakefile workflow/rules lab/Snakefile lab/rules
 
 # One lock serves CPU and CUDA machines: torch and what only its CUDA builds need stay out (see envs/README.md).
 OUTSIDE_LOCK := torch triton cuda-bindings cuda-pathfinder cuda-toolkit nvidia-cublas nvidia-cuda-cupti \

@@ -8,7 +8,7 @@ from snakemake.utils import min_version
 min_version("9.27")
 
 
-configfile: f"{workflow.basedir}/config/config.yaml"
+configfile: f"{workflow.current_basedir}/config/config.yaml"
 
 
 report: "workflow/report/captions/workflow.rst"
@@ -25,7 +25,6 @@ container: image
 
 include: "workflow/rules/stages.smk"
 include: "workflow/rules/deliver.smk"
-include: "workflow/rules/studies.smk"
 include: "workflow/rules/batch.smk"
 
 

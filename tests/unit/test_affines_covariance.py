@@ -14,7 +14,7 @@ from iif_core.fitting.population import ProfiledRoughness, initial_population, p
 from iif_core.fitting.problem import FitOptions
 from iif_core.fitting.selection import KINDS, ROUGHNESS_GRID, profile_roughness
 from iif_core.reflectance.material import IDENTITY
-from tests.benchmarks.affines_coverage import FAMILIES, planted
+from lab.benchmarks.affines_coverage import FAMILIES, planted
 from tests.unit.planted_fit import problem_of
 
 

@@ -623,9 +623,10 @@ def test_messages_do_not_steer_a_terminal(project, monkeypatch, capsys):
     """Whatever a state file, a name of a file or an error brings: control characters are written out (SECURITY.md)."""
     from workflow import __main__ as commands
     from workflow.artifacts import verify
+    from workflow.runtime import ending
 
     steering, shown = "\x1b]0;x\x07\u202e\x9b2J", r"\x1b]0;x\x07\u202e\x9b2J"
-    assert commands._of_the_machine(OSError(28, "No space left on device", steering)).startswith(f"{shown}: the disk is full")
+    assert ending.of_the_machine(OSError(28, "No space left on device", steering)).startswith(f"{shown}: the disk is full")
     JobState("a", "base").failed(f"{steering}\nsecond line")
     (line,) = reasons(0.0)
     assert line.endswith(f": {shown}\nsecond line")
@@ -642,24 +643,24 @@ def test_the_shipped_table_can_be_read(repository):
 
 
 def test_an_interrupted_job_does_not_look_like_one_without_memory(tmp_path, monkeypatch):
-    from workflow.__main__ import _guarded
+    from workflow.runtime.ending import guarded
 
     def interrupted():
         raise KeyboardInterrupt
 
     monkeypatch.chdir(tmp_path)
-    assert _guarded("base of x", interrupted, JobState("x", "base")) == 130
+    assert guarded("base of x", interrupted, JobState("x", "base")) == 130
     assert [message.endswith("it was interrupted; the same command continues") for message in reasons(0.0)] == [True]
 
 
 def test_a_job_without_memory_says_so(tmp_path, monkeypatch, caplog):
-    from workflow.__main__ import _guarded
+    from workflow.runtime.ending import guarded
 
     def greedy():
         raise MemoryError("Unable to allocate 9 TiB")
 
     monkeypatch.chdir(tmp_path)
-    assert _guarded("base of x", greedy, JobState("x", "base")) == 1
+    assert guarded("base of x", greedy, JobState("x", "base")) == 1
     (reason,) = reasons(0.0)
     assert "base of x: not enough memory; " in reason and reason.endswith("(Unable to allocate 9 TiB)")
     assert "Traceback" not in caplog.text and "bug" not in caplog.text

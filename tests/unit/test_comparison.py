@@ -8,12 +8,12 @@ from PIL import Image
 
 from iif_core.errors import InputError
 from iif_core.numerics.color import srgb_from_linear
+from lab.studies.grid import Line, draw
 from workflow.artifacts.files import write_exr
 from workflow.artifacts.store import split_rgb
 from workflow.comparison import maps as foreign
 from workflow.comparison.named import digest_of_maps
 from workflow.comparison.pair import _numbers, _words
-from workflow.studies.grid import Line, draw
 
 VIEWS = ["000", "001"]
 VIEW = SimpleNamespace(name="000", width=6, height=4)

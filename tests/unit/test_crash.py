@@ -16,9 +16,9 @@ import pytest
 from iif_core.errors import InputError
 from tests.workflow import crash
 from tests.workflow.faulty_disk import Disk
-from workflow import __main__ as commands
 from workflow.artifacts import StageReader, StageWriter, locks
 from workflow.artifacts import files as io
+from workflow.runtime import ending
 from workflow.stages import publish
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -135,9 +135,7 @@ def test_the_kernel_refuses_and_it_is_told(tmp_path, small_files, kind):
         with pytest.raises(OSError) as caught:
             write(writer)
         small_files(None)
-        assert caught.value.errno == errno.EFBIG and commands._of_the_machine(caught.value).startswith(
-            f"{path}: the file would be"
-        )
+        assert caught.value.errno == errno.EFBIG and ending.of_the_machine(caught.value).startswith(f"{path}: the file would be")
         assert path.read_bytes() == data and list(path.parent.iterdir()) == [path]
 
 
@@ -153,7 +151,7 @@ def test_an_error_of_the_disk_is_one_sentence(tmp_path, monkeypatch, caplog):
         def failed(self, reason):
             raise full
 
-    assert commands._guarded("base of s", lambda: None, Full()) == 1
+    assert ending.guarded("base of s", lambda: None, Full()) == 1
     (record,) = caplog.records
     assert not record.exc_info
     assert record.getMessage().startswith("results/s/logs/base.state.json: the disk is full; make room")

@@ -1,4 +1,4 @@
-"""Planted emission in a room with known materials (tests/benchmarks/emission_planted.py prints the large table)."""
+"""Planted emission in a room with known materials (lab/benchmarks/emission_planted.py prints the large table)."""
 
 import numpy as np
 import pytest

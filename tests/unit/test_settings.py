@@ -121,7 +121,7 @@ def test_scene_over_preset_over_default(scene):
         (GOOD + "affines: {model: iris, solver: adam, epochs: 9}\n", ["`epochs`: read by `model: objects` alone"]),
         (GOOD + "metrics: {views: 0}\n", ["metrics.views", "found 0", "a whole number of at least 1"]),
         (GOOD + "affines: {ridge: 0.1}\n", ["`affines.ridge`: unknown key. It was removed", "no effect"]),
-        (GOOD + "base: {predictions: 99}\n", ["`base: predictions` is 99", "`prior: samples` makes"]),
+        (GOOD + "base: {predictions: 99}\n", ["`base: predictions` is 99", "`prior` makes 8"]),
         (GOOD + "capture: {test_every: 1}\n", ["capture.test_every", "found 1", "2 and more"]),
     ],
 )

@@ -3,23 +3,19 @@
 import json
 
 import numpy as np
-import pandas as pd
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from iif_core.errors import InputError
 from workflow.costs.model import Range
 from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fp
 from workflow.runtime import forecast
-from workflow.settings import loading, study_files
+from workflow.settings import loading
 from workflow.settings.names import QUALITIES, REPOSITORY, quality_names
-from workflow.settings.scene import SceneSettings
 from workflow.settings.yaml_file import read_yaml
-from workflow.trade import bench, choose, front
+from workflow.trade import bench, choose
 from workflow.trade import points as trade_points
-from workflow.trade.points import Point, Pooled
+from workflow.trade.points import Point
 
 SECONDS = {"p01": 30, "p02": 60, "p03": 110, "p04": 400}
 ALBEDO = {"p01": 20.0, "p02": 22.0, "p03": 23.0, "p04": 25.0}
@@ -173,40 +169,6 @@ def test_after_the_run_a_person_learns_whether_the_target_was_reached(table, tmp
     assert choose.reached(choose.read({"budget": 3}, {"budget"}, 2), ["room"]) == []
 
 
-def rows(costs, scores, rooms=("a", "b")):
-    columns = ["scene", "variant", "seed", "quantity", "metric", "protocol", "value", "cpu_seconds", "max_rss_mb", "disk_mb"]
-    out = []
-    for name in costs:
-        for room in rooms:
-            facts = [costs[name], 100.0, 10.0]
-            out.append([room, name, 0, "albedo", "psnr", "scaled", scores[name], *facts])
-            out.append([room, name, 0, "rgb", "psnr", "raw", scores[name], *facts])
-    return pd.DataFrame(out, columns=columns)
-
-
-def test_the_front_has_no_point_that_is_dearer_and_worse():
-    costs = {"a": 10.0, "b": 20.0, "c": 15.0, "d": 40.0, "e": 41.0}
-    scores = {"a": 20.0, "b": 21.0, "c": 19.0, "d": 22.0, "e": 22.5}
-    found = front.front(front.pool(rows(costs, scores)))
-    assert [one.variant for one in found] == ["a", "b", "e"]  # d and e are closer than a step: the better one is kept
-    frame = rows(costs, scores)
-    lacking = frame[~((frame["variant"] == "b") & (frame["scene"] == "a"))]
-    assert [one.variant for one in front.front(front.pool(lacking))] == ["a", "e"]
-
-
-@given(st.lists(st.tuples(st.floats(1, 1e4), st.floats(10, 40)), min_size=1, max_size=30))
-def test_points_of_the_front_are_apart_and_each_is_better_than_all_cheaper_ones(pairs):
-    pooled = sorted((Pooled(str(i), cost, albedo, {}) for i, (cost, albedo) in enumerate(pairs)), key=lambda one: one.cpu_seconds)
-    found = front.front(pooled)
-    assert found and found[0].cpu_seconds <= front.STEP * pooled[0].cpu_seconds
-    for before, after in zip(found, found[1:], strict=False):
-        assert after.albedo >= before.albedo + front.LEAST_GAIN
-    costs = np.array([one.cpu_seconds for one in found])
-    assert (costs[1:] / costs[:-1] >= 1 - 1e-12).all()
-    best = max(one.albedo for one in pooled)
-    assert found[-1].albedo >= best - front.LEAST_GAIN - 1e-9
-
-
 def test_shipped_points_are_a_front_and_every_quality_can_be_loaded():
     known = trade_points.points()
     assert len(known) >= 6 and list(known) == sorted(known) and set(known) <= set(quality_names())
@@ -239,18 +201,6 @@ def test_a_quality_by_name_says_what_it_takes_what_it_scored_and_which_scenes_se
     assert lines[1:] == ["redkitchen may differ: config/scenes/redkitchen.yaml sets capture.views itself"]
     monkeypatch.setattr(choose, "MOST_SCENES", 0)
     assert choose.told(request, {"redkitchen": choose.Choice("draft")})[1:] == ["1 of 1 scenes set some of it themselves"]
-
-
-def test_the_points_that_are_checked_in_other_rooms_are_those_of_the_front(monkeypatch):
-    monkeypatch.chdir(REPOSITORY)
-    design = study_files.load_study("tradeoff_check").design
-    scene = {"source": {"kind": "builtin", "scene": "tiny"}, "prior": {"kind": "simulated"}}
-
-    def settings(layer):
-        return SceneSettings.model_validate(loading.merge(scene, layer))
-
-    checked = [settings(design.overrides(run)) for run in design.runs]
-    assert checked == [settings(read_yaml(REPOSITORY / f"config/quality/{name}.yaml")) for name in trade_points.points()]
 
 
 def test_named_qualities_are_points_in_order_and_neither_end_of_the_front():

@@ -29,12 +29,12 @@ import numpy as np
 
 from iif_core.errors import InputError
 from tests.workflow.faulty_disk import HOSTILE, Disk, Fault, lay_out, tree
-from workflow.__main__ import CAUSES, _of_the_machine
 from workflow.artifacts import StageReader, StageWriter, sound, stamps
 from workflow.artifacts import files as io
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.manifest import MANIFEST, SCENE_SCHEMA
 from workflow.registry import STAGES
+from workflow.runtime.ending import CAUSES, of_the_machine
 from workflow.stages import publish
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -372,7 +372,7 @@ def fault(ready: Prepared, kind: str, call: int, folder: Path) -> str:
                 case.make(NEW)
         except OSError as found:
             error = found
-            said = _of_the_machine(found)
+            said = of_the_machine(found)
             if not found.filename or CAUSES.get(found.errno or 0) is None or not said.endswith(CAUSES[found.errno or 0]):
                 raise Wrong(f"the error does not say which file and what to do: {said}") from None
         finished = case.judge(ready.wanted, NEW)

@@ -28,6 +28,7 @@ from workflow.artifacts import StageReader
 from workflow.artifacts.manifest import MANIFEST
 from workflow.registry import STAGES
 from workflow.runtime import native
+from workflow.runtime.ending import CAUSES
 from workflow.runtime.job import configure_logging
 
 KILL = "kill"
@@ -109,7 +110,7 @@ class Stage:
         code, said, calls = self._run(Fault(kind, call))
         if code and kind != KILL:
             lines = said.strip().splitlines()
-            if "Traceback" in said or not any(lines[-1].endswith(words) for words in commands.CAUSES.values()):
+            if "Traceback" in said or not any(lines[-1].endswith(words) for words in CAUSES.values()):
                 raise Wrong(f"not told in one sentence: {said[-400:]}")
         ended_before = not code and len(calls) <= call  # a run that finds nothing has less to remove
         if (code == -signal.SIGKILL) != (kind == KILL) and not ended_before:

@@ -12,7 +12,7 @@ from workflow.decisions.record import Decision
 from workflow.runtime import forecast
 
 SHIPPED = Path(__file__).with_name("claims.json")
-"""Made by `python -m workflow claims` from the rows of study `regret` (docs/results/plan.md)."""
+"""Made from the rows of the study `regret` (docs/results/plan.md)."""
 STAGES = ("plan", "base", "emission", "shading", "affines", "render")
 """Stages whose cost the shares of `SHIPPED` are of."""
 
@@ -30,7 +30,7 @@ class Whole(NamedTuple):
 
 @lru_cache(None)
 def claims(path: Path = SHIPPED) -> dict[str, Any]:
-    """Return component -> `included` or `left_out` -> gain and shares (`workflow.studies.regret.claims`)."""
+    """Return component -> `included` or `left_out` -> gain and shares (`docs/development/studies.md`)."""
     return json.loads(path.read_text())
 
 

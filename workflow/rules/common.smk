@@ -9,7 +9,9 @@ from pathlib import Path
 
 from snakemake.cli import get_argument_parser
 
-sys.path.insert(0, workflow.basedir)
+# The folder of this workflow, also where another Snakefile takes it as a module; jobs that Snakemake starts elsewhere need it too.
+CHECKOUT = str(Path(workflow.current_basedir).parents[1])
+sys.path.insert(0, CHECKOUT)
 
 from iif_core.errors import InputError
 from workflow.artifacts import links, sound
@@ -21,32 +23,17 @@ from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import events, forecast, input_digests, native
 from workflow.runtime.attempts import RUN, written_out
 from workflow.status import table as status
+from workflow.relighting import copies
 from workflow.relighting.check import check_relightings
 from workflow.settings import SCENE_NAME, scene_file
 from workflow.settings.names import did_you_mean_path
 from workflow.settings import prior as prior_settings
 from workflow.settings import refuse_profile, refuse_scatter, refuse_target, study_files
-from workflow.studies import grid as study_sheet
-from workflow.studies import table as study_table
-from workflow.studies import relit
 from workflow.trade import bench, choose
 
 STARTED = time.time()
 FOLDER = os.getcwd()
 SCATTERED = ("prior",)  # rules of `scattergather` in stages.smk
-KERNEL_BENCHMARKS = "hashgrid|base_cost"
-STABILITY_PARTS = (
-    "kernels",
-    "solvers",
-    "sums",
-    "relations",
-    "digits",
-    "samplers",
-    "renderings",
-    "caches",
-    "extremes",
-    "sensitivity",
-)
 
 native.process_environment()
 if workflow.is_main_process:
@@ -87,7 +74,7 @@ REQUEST = or_stop(
     set(workflow.config_settings.overwrite_config or {}),
     workflow.resource_settings.cores,
 )
-QUALITY = REQUEST.quality  # of studies and batches
+QUALITY = REQUEST.quality  # of batches and comparisons
 CHOSEN = {}
 
 
@@ -115,7 +102,7 @@ def profile_or_stop():
     in another one now, and does not say which that was; the shell does."""
     given = get_argument_parser().parse_args()
     start = os.environ.get("PWD", FOLDER) if given.directory else FOLDER
-    or_stop(refuse_profile, given.workflow_profile, Path(start), Path(workflow.basedir))
+    or_stop(refuse_profile, given.workflow_profile, Path(start), Path(CHECKOUT))
 
 
 or_stop(refuse_scatter, workflow.resource_settings.overwrite_scatter, SCATTERED)
@@ -160,7 +147,7 @@ def image(wildcards):
     even where it does not read it."""
     if "apptainer" not in map(str, workflow.deployment_settings.deployment_method):
         return None
-    path = f"{workflow.basedir}/envs/iif.sif"
+    path = f"{CHECKOUT}/envs/iif.sif"
     if " " in path:
         stop(
             f"{path}: Snakemake does not read an image with a space in its path. Move the checkout to a folder without spaces,"
@@ -173,9 +160,6 @@ wildcard_constraints:
     scene=SCENE_NAME,
     first=SCENE_NAME,
     second=SCENE_NAME,
-    study=rf"(?!(?:{KERNEL_BENCHMARKS}|stability)\.){study_files.STUDY}",
-    benchmark=KERNEL_BENCHMARKS,
-    part="|".join(STABILITY_PARTS),
     plan=SCENE_NAME,
 
 
@@ -354,7 +338,7 @@ def relit_inputs(wildcards):
         )
     if os.path.isdir(folder) and not os.path.isfile(f"{folder}/contact_sheet.png"):
         workflow.dag.forcefiles.add(folder)  # it holds plans alone
-    source = or_stop(relit.source, scene, plan, quality_of(scene))
+    source = or_stop(copies.source, scene, plan, quality_of(scene))
     folder_or_stop(folder)
     again_if_unsound(
         folder,
@@ -447,13 +431,6 @@ def scored(wildcards):
     }
 
 
-def stability_code(wildcards):
-    """Digest of everything that the study of stability measures, and measures with."""
-    return fingerprints.modules_digest(
-        fingerprints.import_closure("workflow.stability.rows")
-    )
-
-
 def relight_inputs(*names):
     """What is relit; a scene without relightings, or one of which something does not exist, stops here, before any job."""
     inputs_of = reads("relight", *names)
@@ -492,21 +469,6 @@ def status_alone(wildcards):
     stop(
         "status: ask for it alone, `snakemake status`; of some scenes, `python -m workflow status <scene> ...`"
     )
-
-
-# ---------------------------------------------------------------------------------------------------------- studies
-
-
-def of_study(compute):
-    """`compute(study, QUALITY)` for the study of a target; what is wrong in its file stops here, before any job."""
-    return lambda wildcards: or_stop(compute, wildcards.study, QUALITY)
-
-
-def study_inputs(study, quality):
-    """Manifests of a study; what it will leave out is said before hours of work, not after."""
-    for note in study_table.left_out(study, quality):
-        print(f"study {study}: {note}", file=sys.stderr)
-    return study_table.inputs(study, quality)
 
 
 # ------------------------------------------------------------------------------------------------------------ batch

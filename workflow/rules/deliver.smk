@@ -156,3 +156,17 @@ rule score:
     shell:
         "python3 -m workflow score {wildcards.scene} {params.scored[folder]:q} --colour {params.scored[colour]:q}"
         " --quality {params.scored[quality]} --output {output.page:q} --log {log:q}"
+
+
+# Once, with a connection; LPIPS on VGG16 is then part of every score of a study.
+rule lpips_vgg:
+    """Fetch the weights of VGG16, with which the paper computes LPIPS."""
+    output:
+        weights="results/weights/lpips_vgg.npz",
+    log:
+        "results/weights/lpips_vgg.log",
+    localrule: True
+    message:
+        "fetching the weights of VGG16 (download 64 MB, kept 29 MB)"
+    shell:
+        "python3 -m workflow lpips_vgg --log {log:q}"

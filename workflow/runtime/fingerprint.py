@@ -37,7 +37,6 @@ INFRASTRUCTURE = (
     "workflow.registry",
     "workflow.costs",
     "workflow.settings",
-    "workflow.studies",
     "workflow.batch",
     "workflow.artifacts",
     "iif_core.errors",

@@ -83,7 +83,7 @@ class Design(Section):
     factors: dict[str, list[Any]] = Field(min_length=1)
     """Setting, or settings joined by ` + `, -> its levels, from cheap to dear."""
     trajectories: Literal[0] | Annotated[int, Field(ge=2)] = 0
-    """The first runs are this number of trajectories of Morris (`workflow/studies/screening.py`): the page then has the effect of
+    """The first runs are this number of trajectories of Morris (docs/development/studies.md): the page then has the effect of
     each factor."""
     runs: list[str] = Field(min_length=1)
     """In the order of the trajectories; a run that is there twice is one variant."""
@@ -323,7 +323,7 @@ def _design(design: Design, path: Path, others: dict[str, Variant]) -> dict[str,
     if len(design.runs) < design.trajectories * whole:
         raise InputError(
             f"{path}: `design.trajectories`: found {design.trajectories}, which are {design.trajectories * whole} runs;"
-            f" there are {len(design.runs)}. `python -m workflow design {path.stem}` makes them"
+            f" there are {len(design.runs)}. docs/development/studies.md says what makes them"
         )
     return out
 
@@ -347,7 +347,7 @@ def _check_trajectories(design: Design, whole: int, path: Path) -> None:
         ):
             raise InputError(
                 f"{path}: `design.runs`: those from {one[0]!r} on are no trajectory, in which each step changes one factor by"
-                f" two levels and each factor changes once. `python -m workflow design {path.stem}` makes them"
+                f" two levels and each factor changes once. docs/development/studies.md says what makes them"
             )
 
 

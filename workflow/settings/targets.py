@@ -8,7 +8,7 @@ from pathlib import Path
 
 from iif_core.errors import InputError
 from workflow.registry import STAGES
-from workflow.settings import batch_table, study_files
+from workflow.settings import batch_table
 from workflow.settings.names import did_you_mean, did_you_mean_path, scene_names
 
 FOLDERS = ("scenes", "plan", "bench", "relight", "score")
@@ -31,10 +31,8 @@ def refuse_target(target: str, rules: Iterable[str], root: Path = Path(".")) -> 
     raise InputError(
         f"{target}: no rule makes this.{hint} Targets are scenes/<name>, plan/<name>, bench/<name> and relight/<name> with the"
         " name of one scene (letters, digits, _ and -), relight/<name>/<plan> with a plan of config/relight/, score/<name>,"
-        " compare/<a>,<b> with the names of two results,"
-        " results/<name>/<stage>/manifest.json, results/studies/<study>.parquet and .grid.pdf,"
-        " `scenes`, `status` and `verify`; docs/reference/commands.md lists them, and `snakemake --list` the rules that"
-        " `--forcerun` takes."
+        " compare/<a>,<b> with the names of two results, results/<name>/<stage>/manifest.json, `scenes`, `status` and `verify`;"
+        " docs/reference/commands.md lists them, and `snakemake --list` the rules that `--forcerun` takes."
     )
 
 
@@ -87,7 +85,7 @@ def _meant(target: str, scenes: list[str], rules: list[str], root: Path) -> str:
     if parts[0] in FOLDERS and len(parts) > 1:
         return did_you_mean(parts[-1], scenes, parts[0] + "/{}") or did_you_mean(parts[1], scenes, parts[0] + "/{}")
     if parts[:2] == ("results", "studies"):
-        return did_you_mean(target, [f"results/studies/{name}.parquet" for name in study_files.study_names(root)])
+        return " Studies have a Snakefile of their own (docs/development/studies.md)."
     if parts[0] == "results" and len(parts) > 2:
         stages = [f"results/{parts[1]}/{stage}/manifest.json" for stage in STAGES if stage != "publish"]
         same = [path for path in stages if Path(path).parts[2] == parts[2]]

@@ -1,4 +1,4 @@
-"""The points of the measured front and what they scored (points.json, made by `python -m workflow points`)."""
+"""The points of the measured front and what they scored (points.json, from the study `tradeoff`)."""
 
 from __future__ import annotations
 
