@@ -96,7 +96,7 @@ test: setup node
 test-all: setup node
 	$(PYTHON_BIN) -m pytest $(IN_PARALLEL) -o faulthandler_timeout=0 $(PYTEST_ARGS)
 
-# The counts are kept in docs/results/data/reliability_fuzz.json.
+# The counts are kept in lab/notebook/data/reliability_fuzz.json.
 CASES ?= 100000
 SEED ?= 0
 JOBS ?= $(shell nproc 2>/dev/null || echo 2)

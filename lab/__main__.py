@@ -41,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
     command("relighting", quality=True)
     stability = command("stability")
     stability.add_argument("part", nargs="?", help="part that is measured; without it, the parts are collected")
-    stability.add_argument("--keep", action="store_true", help="copy the collected table to docs/results/ and make its page")
+    stability.add_argument("--keep", action="store_true", help="copy the collected table to lab/notebook/ and make its page")
     stability.add_argument("--fingerprint", help="of the code; recorded by Snakemake, not checked")
     command("points")
     command("claims")

@@ -12,7 +12,7 @@ from workflow.costs.machine import SHORTEST
 from workflow.costs.model import MEASURES, SHIPPED, Fits, fit_rows, write_fits
 from workflow.costs.records import gather, read_rows, write_rows
 
-TABLE = Path("docs/results/data/costs.csv")
+TABLE = Path("lab/notebook/data/costs.csv")
 """The rows that the shipped coefficients were fitted to."""
 
 

@@ -7,7 +7,7 @@ again, and once more, and judges: every run ends by itself, every scene but the 
 summary.tsv with its cause, the second run delivers the rest, and the third has nothing to do.
 
 It may be killed and goes on with the same command; `--fresh` begins anew. The folder is /tmp/iif-batch, or `--folder`. One row in
-docs/results/data/reliability_batch.json with `--keep`; `python lab/benchmarks/reliability.py` makes the page.
+lab/notebook/data/reliability_batch.json with `--keep`; `python lab/benchmarks/reliability.py` makes the page.
 A full disk (a small tmpfs) needs root; without it that fault is left out.
 """
 
@@ -37,7 +37,7 @@ from tests.workflow.prepared import prepare
 from tests.workflow.support import TINY
 
 ROOT = Path(__file__).resolve().parents[2]
-ROWS = ROOT / "docs/results/data/reliability_batch.json"
+ROWS = ROOT / "lab/notebook/data/reliability_batch.json"
 HEADER = "name\tsource\tpath\tbase\toverrides\n"
 SMALL = (
     "prior.kind=retinex;segmentation.kind=geometry;capture.width=48;capture.height=48;capture.views=4;emission.rows=2000;"
@@ -448,7 +448,7 @@ def main() -> int:
     parser.add_argument("--kinds", nargs="+", choices=FAULTS, default=list(FAULTS))
     parser.add_argument("--folder", type=Path, default=Path("/tmp/iif-batch"))
     parser.add_argument("--fresh", action="store_true", help="begin anew")
-    parser.add_argument("--keep", action="store_true", help="keep the row in docs/results/data/")
+    parser.add_argument("--keep", action="store_true", help="keep the row in lab/notebook/data/")
     arguments = parser.parse_args()
     kinds = [kind for kind in arguments.kinds if kind != "disk" or os.geteuid() == 0]
     plan = plan_of(arguments.real, arguments.prepared, arguments.faults, kinds)

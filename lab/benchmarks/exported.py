@@ -2,11 +2,11 @@
 
     python lab/benchmarks/exported.py kitchen modern-hall [--quality draft] [--views 3] [--samples 64] [--replicates 12]
 
-Run it in a working folder where the scenes are finished. For each it prints, and keeps in docs/results/data/exported.json:
+Run it in a working folder where the scenes are finished. For each it prints, and keeps in lab/notebook/data/exported.json:
 faults that Khronos' validator finds; mean differences of the textures in `scene.glb`, read by trimesh, from the values that were
 written, and of what they show from `maps/` of the same views; and the radiance of `mitsuba/` by `render.py` (the exact
 reflectance) and as stock `scene.xml`, over that of the workflow's own renderer: ratio of the means with its standard error, and
-Sidak's test of all pixels. The tables of docs/results/exports.md are made anew.
+Sidak's test of all pixels. The tables of lab/notebook/exports.md are made anew.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import numpy as np
 from workflow.runtime import native
 
 VALIDATOR = Path(__file__).resolve().parents[2] / ".node/node_modules/gltf-validator"
-ROWS, PAGE = Path("docs/results/data/exported.json"), Path("docs/results/exports.md")
+ROWS, PAGE = Path("lab/notebook/data/exported.json"), Path("lab/notebook/exports.md")
 LIGHT = {
     "exact": "render.py",
     "stock": "scene.xml",

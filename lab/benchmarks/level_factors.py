@@ -4,7 +4,7 @@ do, without a run: from what the fits of finished rooms knew, and the truth.
     python lab/benchmarks/level_factors.py [--try CENTRE_BASE WIDTH_BASE CENTRE_LIGHT WIDTH_LIGHT] [--table FILE.csv]
     python lab/benchmarks/level_factors.py --from FOLDER SCENE... --table FILE.csv
 
-The first form reads `docs/results/data/object_levels.csv` (simulated predictions) or another table, whose rows are objects: what
+The first form reads `lab/notebook/data/object_levels.csv` (simulated predictions) or another table, whose rows are objects: what
 the last comparison of a fit was given (mean base albedo, level that the photographs ask for, scatter of the predictions, smooth
 error of the light, pixels, the error of the base that the prior states), the true mean albedo, and the pixels that show it. It
 prints the true factors, the scale of Student's t of the real errors over what Eq. M.32 and M.33 say, and PSNR in dB of the

@@ -4,7 +4,7 @@
 
 What is asked for is what a plan says that knows nothing but the files of the scene (as on a cluster, before its capture is
 there). Peak memory is that of the process (`max_rss_mb` of `benchmarks/<stage>.parts.json`), which the load of the machine does
-not change. The rows go to docs/results/data/reliability_memory.json; `reliability.py` makes the table of them.
+not change. The rows go to lab/notebook/data/reliability_memory.json; `reliability.py` makes the table of them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from workflow.costs.size import size_of_capture
 from workflow.registry import STAGES
 from workflow.runtime import forecast, native
 
-ROW = Path(__file__).resolve().parents[2] / "docs/results/data/reliability_memory.json"
+ROW = Path(__file__).resolve().parents[2] / "lab/notebook/data/reliability_memory.json"
 
 
 def asked(scene: str, quality: str) -> dict[str, int]:

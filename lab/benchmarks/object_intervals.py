@@ -4,7 +4,7 @@
 
 Run it in a working folder where the scenes, which need a truth, are finished. The truth of an object is the mean of the true map
 over all its pixels that count in stage `metrics`; objects with fewer pixels, or without an interval, are left out. Rows are
-kept in docs/results/data/object_intervals.json, and the table of docs/results/intervals.md is made anew.
+kept in lab/notebook/data/object_intervals.json, and the table of lab/notebook/intervals.md is made anew.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
 
-ROWS, PAGE = Path("docs/results/data/object_intervals.json"), Path("docs/results/intervals.md")
+ROWS, PAGE = Path("lab/notebook/data/object_intervals.json"), Path("lab/notebook/intervals.md")
 
 
 def truths(job: Any) -> dict[str, dict[int, tuple[int, np.ndarray]]]:

@@ -1,4 +1,4 @@
-"""The page docs/results/reliability.md: its tables are made anew from the rows that other commands have left.
+"""The page lab/notebook/reliability.md: its tables are made anew from the rows that other commands have left.
 
     python lab/benchmarks/reliability.py                  the page alone
     python lab/benchmarks/reliability.py --damage folder  also damages a copy of its results/, file by file
@@ -28,8 +28,8 @@ from workflow.artifacts.verify import damaged
 from workflow.report.blocks import fill, markdown
 
 ROOT = Path(__file__).resolve().parents[2]
-DATA = ROOT / "docs/results/data"
-PAGE = ROOT / "docs/results/reliability.md"
+DATA = ROOT / "lab/notebook/data"
+PAGE = ROOT / "lab/notebook/reliability.md"
 HARMLESS = ("cases", "accepted", "refused")
 
 

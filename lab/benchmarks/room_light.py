@@ -6,8 +6,8 @@ Run it in a working folder where stage room of the scenes is finished. For each 
 software, walks to the cameras of some photographs, and looks at a grid of pixels with one lamp on at a time, without gloss. The
 exposure is chosen for each lamp so that few pixels are clipped; those are left out. The light of the lamp at the points under
 the pixels is traced anew, on the mesh of the photographs and by the integrator of stage shading, times the diffuse reflectance
-that the page has there. Single texels are compared with many whole paths. Rows are kept in docs/results/data/room_light.json,
-and the tables of docs/results/exports.md are made anew.
+that the page has there. Single texels are compared with many whole paths. Rows are kept in lab/notebook/data/room_light.json,
+and the tables of lab/notebook/exports.md are made anew.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
 
-ROWS = Path("docs/results/data/room_light.json")
+ROWS = Path("lab/notebook/data/room_light.json")
 STEP = 24
 """Pixels of the canvas between two that are looked at."""
 BRIGHT = 0.9

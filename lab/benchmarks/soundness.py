@@ -1,7 +1,7 @@
 """What it costs a plan to compare the stamps of every artefact: `python lab/benchmarks/soundness.py [--scenes 100]`.
 
 Scenes with as many stages and files as the kitchen at draft (small files: their contents are not read), in a temporary folder.
-One row in docs/results/data/soundness.json; the page is docs/results/reliability.md.
+One row in lab/notebook/data/soundness.json; the page is lab/notebook/reliability.md.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from workflow.artifacts import StageWriter, sound, stamps
 from workflow.artifacts.files import sha256_of
 from workflow.registry import STAGES
 
-ROWS = Path(__file__).resolve().parents[2] / "docs/results/data/soundness.json"
+ROWS = Path(__file__).resolve().parents[2] / "lab/notebook/data/soundness.json"
 FILES = 33
 """Of each stage: 15 stages with 495 files."""
 

@@ -4,7 +4,7 @@ near its rays come to the rate at which the mesh can be traced at all, and its l
     python lab/benchmarks/stage_profile.py kitchen [--quality draft] [--threads 2] [--stages base emission] [--rays] [--loops]
 
 Run it in a working folder where the scene is finished; each stage is made again, in a process of its own, and writes the same
-files. Prints a table for docs/results/performance.md. Seconds of wall time under Python's profiler, which slows Python code by
+files. Prints a table for lab/notebook/performance.md. Seconds of wall time under Python's profiler, which slows Python code by
 some ten percent; CPU seconds are those of the process. Start: the interpreter and the imports before the stage begins.
 
 With `--rays` each stage that traces is made once more to count its rays, nearest hits and tests of visibility alike, and the rate

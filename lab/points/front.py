@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 STUDY = "tradeoff"
-TABLE = Path("docs/results/data/tradeoff.csv")
+TABLE = Path("lab/notebook/data/tradeoff.csv")
 STEP = 1.2
 """Of the runs that cost less than this many times the cheapest of them, the best one becomes a point."""
 LEAST_GAIN = 0.1

@@ -1,4 +1,4 @@
-"""The tables of docs/results/stability.md, made from the rows of the study."""
+"""The tables of lab/notebook/stability.md, made from the rows of the study."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The picture of docs/results/stability.md: which error of the input, and which setting, costs most albedo."""
+"""The picture of lab/notebook/stability.md: which error of the input, and which setting, costs most albedo."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from workflow.settings.names import REPOSITORY
 if TYPE_CHECKING:
     import pandas as pd
 
-PICTURE = REPOSITORY / "docs/pictures/sensitivity.png"
+PICTURE = REPOSITORY / "lab/notebook/pictures/sensitivity.png"
 _COLOURS = ("#0072b2", "#d55e00", "#009e73")  # colour-blind safe (Okabe, Ito)
 
 

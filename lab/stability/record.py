@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 PARTIAL = Path("results/studies/stability")
 TABLE = Path("results/studies/stability.parquet")
-KEPT = REPOSITORY / "docs/results/data/stability.csv"
-PAGE = REPOSITORY / "docs/results/stability.md"
+KEPT = REPOSITORY / "lab/notebook/data/stability.csv"
+PAGE = REPOSITORY / "lab/notebook/stability.md"
 
 
 def code() -> str:
@@ -67,7 +67,7 @@ def collect() -> None:
 
 
 def keep() -> None:
-    """Copy the table to docs/results/data/stability.csv, and make tables and picture of docs/results/stability.md from it anew.
+    """Copy the table to lab/notebook/data/stability.csv, and make tables and picture of lab/notebook/stability.md from it anew.
 
     Raises:
         InputError: there is no table.
@@ -84,7 +84,7 @@ def keep() -> None:
 
 
 def kept() -> pd.DataFrame:
-    """Read docs/results/data/stability.csv."""
+    """Read lab/notebook/data/stability.csv."""
     import pandas as pd
 
     return pd.read_csv(KEPT, keep_default_na=False, na_values={"value": [""], "limit": [""]})

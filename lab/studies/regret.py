@@ -1,5 +1,5 @@
 """Was the plan right? Every component against its opposite: what leaving out a kept one costs, and whether one that was left out
-would have helped (docs/results/plan.md)."""
+would have helped (lab/notebook/plan.md)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from workflow.settings.study_files import Opposite, Study
 if TYPE_CHECKING:
     import pandas as pd
 
-TABLE = Path("docs/results/data/regret.csv")
+TABLE = Path("lab/notebook/data/regret.csv")
 """The rows from which the claims of the plan are made."""
 CURRENCY = ("rgb_held_out", "psnr", "raw")
 """The score in which gains are counted, dB. Of residuals with a fitted scale, 1 dB is ln(10)/20 = 0.115 nats of log likelihood

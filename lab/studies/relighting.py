@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 STUDY = "relighting"
-KEPT = REPOSITORY / "docs/results/data/relighting.csv"
-LAMPS = REPOSITORY / "docs/results/data/relighting_lamps.csv"
-PAGE = REPOSITORY / "docs/results/relighting.md"
-PICTURE = REPOSITORY / "docs/pictures/relighting.jpg"
+KEPT = REPOSITORY / "lab/notebook/data/relighting.csv"
+LAMPS = REPOSITORY / "lab/notebook/data/relighting_lamps.csv"
+PAGE = REPOSITORY / "lab/notebook/relighting.md"
+PICTURE = REPOSITORY / "lab/notebook/pictures/relighting.jpg"
 WIDTH = 1200
 """Pixels of the picture of the page, which has the first room alone, so that its labels can be read."""
 NOISE = "noise"
@@ -38,7 +38,7 @@ WORDS = {f"relit_{kind}": words for kind, words in LIGHTS.items()}
 
 
 def keep(quality: str) -> None:
-    """Add the rows of the cells that are finished to docs/results/data/relighting.csv, and make the page anew: tables, picture.
+    """Add the rows of the cells that are finished to lab/notebook/data/relighting.csv, and make the page anew: tables, picture.
 
     Raises:
         InputError: nothing was ever scored.

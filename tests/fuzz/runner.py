@@ -40,7 +40,7 @@ MEMORY = 1 << 30
 CPU_SECONDS = 10
 WALL_SECONDS = 60
 LONGEST_MESSAGE = 4_000
-ROW = Path("docs/results/data/reliability_fuzz.json")
+ROW = Path("lab/notebook/data/reliability_fuzz.json")
 PORTION = 5_000
 """Cases after which the counts are written down, so that a run that is stopped can go on (`--continue`)."""
 TOGETHER = 10
@@ -332,7 +332,7 @@ def fuzz(cases: list[tuple[str, int]], seed: int, jobs: int, tell: float = 60.0)
 
 
 def table(results: list[Result], seed: int) -> dict[str, Any]:
-    """Return the counts that docs/results shows: of each verdict, by kind of file and in all."""
+    """Return the counts that the notebook shows: of each verdict, by kind of file and in all."""
     kinds = {kind: Counter(r.verdict for r in results if r.kind == kind) for kind in sorted({r.kind for r in results})}
     rows = {kind: {"cases": sum(found.values()), **{v: found[v] for v in (*GOOD, *BAD)}} for kind, found in kinds.items()}
     total = {key: sum(row[key] for row in rows.values()) for key in ("cases", *GOOD, *BAD)}

@@ -1,4 +1,4 @@
-"""How the constants of the calibrated uncertainty were fitted (Eq. F.48; docs/results/fusion.md)."""
+"""How the constants of the calibrated uncertainty were fitted (Eq. F.48; lab/notebook/fusion.md)."""
 
 import numpy as np
 from numpy.typing import NDArray

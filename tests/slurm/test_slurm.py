@@ -1,7 +1,7 @@
 """The Slurm profiles on a real Slurm of one node, with or without accounting: tests/slurm/run.sh starts it (`make test-slurm`).
 
 `IIF_SLURM_SCENE=kitchen bash tests/slurm/run.sh -k overhead` measures what a job for a scene costs beside its stages, and keeps
-the row for docs/results/reliability.md; it wants a machine that does nothing else, and takes two drafts of the scene.
+the row for lab/notebook/reliability.md; it wants a machine that does nothing else, and takes two drafts of the scene.
 """
 
 import csv
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif("IIF_SLURM_STATE" not in os.environ, reason="no 
 ACCOUNTING = bool(os.environ.get("IIF_SLURM_ACCOUNTING"))
 SCENES = "abc"
 PROFILES = REPOSITORY / "workflow/profiles"
-ROW = REPOSITORY / "docs/results/data/reliability_slurm.json"
+ROW = REPOSITORY / "lab/notebook/data/reliability_slurm.json"
 HOG = """
 import sys, time
 from workflow.runtime.job_state import JobState

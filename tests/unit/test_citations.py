@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 EQUATION = re.compile(r"\bEqs?\. ([A-Z])\.(\d+[a-z]?)(?:(?:, | and | to |-)(?:([A-Z])\.)?(\d+[a-z]?))*")
 NUMBER = re.compile(r"\b([A-Z])\.(\d+[a-z]?)\b")
-PAGE = re.compile(r"(?<![\w/.-])docs/[\w/-]+\.md(?:#[\w-]+)?")
+PAGE = re.compile(r"(?<![\w/.-])(?:docs|lab/notebook)/[\w/-]+\.md(?:#[\w-]+)?")
 LINK = re.compile(r"(?<!!)\[[^\]\n]*\]\(([^)\s]+)\)|!\[[^\]]*\]\(([^)\s]+)\)")
 UNSHIPPED = re.compile(r"\b[A-Z]{6,} (?:\d+\.\d+|H\d+)\b|\bH\d{1,2}\b")  # sections of papers in capitals, numbered hazards
 PAGE_OF_LETTER = {

@@ -118,7 +118,7 @@ def test_gloss_is_judged_by_the_truth_or_else_by_its_intervals():
 
 
 def test_how_often_intervals_hold_is_what_was_measured(repository):
-    rows = json.loads((repository / "docs/results/data/object_intervals.json").read_text())
+    rows = json.loads((repository / "lab/notebook/data/object_intervals.json").read_text())
     held = [round(100 * row["roughness_inside"]) for row in rows]
     assert (min(held), max(held)) == ROUGHNESS_HELD
 

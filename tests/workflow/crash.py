@@ -3,7 +3,7 @@
 A trial ends a run at one point, looks at what is there, and runs again. What is there must be the earlier result, the new one, or
 visibly unfinished; the second run must end with the bytes of an undisturbed one.
 
-`python -m tests.workflow.crash --all` tries every point of the layer and writes docs/results/data/reliability_crash.json;
+`python -m tests.workflow.crash --all` tries every point of the layer and writes lab/notebook/data/reliability_crash.json;
 `--stages <file>` adds what `python -m tests.workflow.crash_stages` printed of the stages of a scene.
 """
 
@@ -38,7 +38,7 @@ from workflow.runtime.ending import CAUSES, of_the_machine
 from workflow.stages import publish
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-PLACE = REPOSITORY / "docs/results/data/reliability_crash.json"
+PLACE = REPOSITORY / "lab/notebook/data/reliability_crash.json"
 FAULTS = ("ENOSPC", "EIO", "EINTR", "short", "torn", "full")
 VIEWS = ("000", "001")
 

@@ -1,4 +1,4 @@
-"""The extremes of docs/results/extremes.md through the stages from emission to report: finite, within range, explained."""
+"""The extremes of lab/notebook/extremes.md through the stages from emission to report: finite, within range, explained."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -168,8 +168,8 @@ def test_a_lamp_adds_what_paths_find(room, stored, finished, monkeypatch, llvm):
             found[number_of_lamp].append(pictures[0] - pictures[1])
             traced[number_of_lamp].append(kd * (paths[0] - paths[1]))
     for change, expected in ((np.concatenate(f), np.concatenate(t)) for f, t in zip(found, traced, strict=True)):
-        # More than the 0.03 of rooms with maps of their own size (docs/results/exports.md#room): a map of 128 x 128 is too coarse
-        # for the light beside the lamps (docs/development/decisions.md#light-maps).
+        # More than the 0.03 of rooms with maps of their own size (lab/notebook/exports.md#room): a map of 128 x 128 is too coarse
+        # for the light beside the lamps (lab/notebook/decisions.md#light-maps).
         assert change.mean() == pytest.approx(expected.mean(), rel=0.04)
         assert np.median(np.abs(change - expected).mean(1)) < 0.15 * expected.mean()
 

@@ -255,7 +255,7 @@ def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str],
 
 def _encoding(table: Any) -> dict[str, Any]:
     """Return how columns are packed: floats byte by byte and without a dictionary of their values, which hardly ever repeat in
-    tables of pixels and cells (docs/results/performance.md)."""
+    tables of pixels and cells."""
     import pyarrow as pa
 
     leaves = {

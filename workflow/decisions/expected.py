@@ -12,7 +12,7 @@ from workflow.decisions.record import Decision
 from workflow.runtime import forecast
 
 SHIPPED = Path(__file__).with_name("claims.json")
-"""Made from the rows of the study `regret` (docs/results/plan.md)."""
+"""Made from the rows of the study `regret` (docs/method/plan.md#what-is-expected-of-a-component)."""
 STAGES = ("plan", "base", "emission", "shading", "affines", "render")
 """Stages whose cost the shares of `SHIPPED` are of."""
 

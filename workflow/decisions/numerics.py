@@ -1,5 +1,5 @@
 """Figures by which a stage says where its arithmetic came close to its end (`numerics` in its JSON); the report warns of those
-beyond their limits (docs/results/stability.md#guards)."""
+beyond their limits (docs/method/numerics.md#guards)."""
 
 from __future__ import annotations
 

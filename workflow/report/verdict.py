@@ -245,7 +245,7 @@ def _finding(
 def _warned(e: Evidence, stages: Sequence[str]) -> list[Finding]:
     return [
         Finding(
-            AMBER, f"Numerical warning of stage {stage}: {sentence}", "See the sentence itself; docs/results/stability.md#guards"
+            AMBER, f"Numerical warning of stage {stage}: {sentence}", "See the sentence itself; docs/method/numerics.md#guards"
         )
         for stage, sentence in e.warnings
         if stage in stages
@@ -411,7 +411,7 @@ def _gloss(e: Evidence) -> list[Finding | None]:
 
 
 ROUGHNESS_HELD = (76, 85)
-"""Per cent of the objects whose true roughness is inside the 95 % interval, in three rooms (docs/results/intervals.md)."""
+"""Per cent of the objects whose true roughness is inside the 95 % interval, in three rooms (docs/guide/accuracy.md)."""
 
 
 def _off(psnr: float | None) -> str:

@@ -84,4 +84,4 @@ class SecondLook(Section):
 
     enabled: bool = True
     """`false`: the fit starts from the first base texture, which saves a sixth of the CPU time from `prior` to `affines`
-    (docs/results/rooms.md#a-second-look)."""
+    (docs/method/priors.md#a-second-look)."""

@@ -61,7 +61,7 @@ class SceneSettings(Section):
     device: Literal["auto", "cpu", "cuda"] = "cpu"
     """Where rays are traced. `auto`: on a CUDA device where the machine has one, else on the CPU; `cuda` is an error where there
     is none. Recorded in the manifests, and no reason to run a job again: numbers differ by rounding and noise alone. What a GPU
-    brings is in docs/results/performance.md#a-gpu."""
+    brings is in docs/guide/quality.md#a-gpu."""
 
     @field_validator("prior", mode="before")
     @classmethod

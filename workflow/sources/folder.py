@@ -291,7 +291,7 @@ class _Capture:
 
     def _look_for_light(self, name: str, pixels: np.ndarray) -> bool:
         """Remember a photograph whose usable pixels (n, 3) are all black or all white. Returns whether they may be used: those of
-        a black one would say that all surface that it shows is black (docs/results/stability.md#extremes)."""
+        a black one would say that all surface that it shows is black."""
         if not len(pixels):
             return True
         if (pixels.max(1) <= (BLACK if self.encoded else 0)).mean() >= EVERYWHERE:

@@ -100,7 +100,7 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Callable[[
             population=settings.population,
             robust_width=settings.robust_width,
             response_prior=prior,
-            # This prior read the brightness of objects from the same photographs (docs/results/real-scenes.md).
+            # This prior read the brightness of objects from the same photographs.
             base_tells_levels=job.settings.prior.kind != "retinex",
             lobes=has_lobes(job),
             metals=job.settings.override.components.metallic != "off",
