@@ -28,7 +28,7 @@ is sought; width (of the logarithm) of its prior."""
 _LIGHT_FACTORS, _LIGHT_FACTOR, _LIGHT_FACTOR_WIDTH = np.geomspace(0.5, 4.0, 13), 1.5, 0.35
 """The same for the factor between the error that all pixels of an object share and its smooth part within the object."""
 _LIGHT_FACTOR_MEASURED = 2.2
-"""That factor in rooms of known materials (docs/results/fitting.md#constants-and-what-they-were-chosen-on), which is claimed
+"""That factor in rooms of known materials, which is claimed
 where the prior states its errors."""
 _QUARTILES = 1.349
 """Distance of the quartiles of a normal distribution, in standard deviations."""

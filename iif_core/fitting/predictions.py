@@ -15,7 +15,7 @@ DEGREES_OF_FREEDOM = 4.0
 """Of Student's t of the error of roughness."""
 SECOND_LOOK = 0.85
 """Error of the brightness of an object in a base that was predicted under the computed light, relative to the first base
-(docs/results/rooms.md#a-second-look)."""
+(docs/method/priors.md#a-second-look)."""
 _RAREST = 1e-3
 """Metallic closer to 0 or 1 than this says no more than this."""
 

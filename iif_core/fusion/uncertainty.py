@@ -57,7 +57,7 @@ CALIBRATION = {
     "roughness": Calibration(0.4715, 0.496, 0.602, 0.592, -0.131, 0.8, 0.15),
     "metallic": Calibration(0.4884, 0.502, 0.602, 0.596, -0.133, 0.8, 0.15),
 }
-"""Fitted to one scene with ground truth; data and check on another scene: docs/results/fusion.md."""
+"""Fitted to one scene with ground truth, checked on another (docs/method/fusion.md#calibrated-uncertainty)."""
 
 MIN_OBJECT_CELLS = 100
 """Fewest cells of an object that is judged; with fewer, the affine gauge follows the errors themselves."""

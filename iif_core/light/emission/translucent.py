@@ -6,7 +6,7 @@ import numpy as np
 
 TRANSMITTANCE = 0.5
 """Share of the light that passes straight through curtains and blinds. What a room shows is this times the light behind them,
-so another value changes that light first of all (docs/results/light.md#constants-screened)."""
+so another value changes that light first of all (docs/method/light.md#surface-that-lets-light-through)."""
 OPEN_SHARE = 0.05
 """Share of the pixels of an object with nothing behind them, at least."""
 OPEN_RATIO = 1.5
