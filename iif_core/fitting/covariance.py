@@ -37,8 +37,12 @@ def sandwich_covariance(
         Both float64; 0 for numbers that were not free.
     """
     free, by_response, schur = state.free, system.by_response, system.schur
+    # T_o of Eq. M.40: an object follows the response also through the centre of its prior.
     if prior.drift is not None:
         by_response = by_response - system.inverse @ prior.drift
+
+    # -------- what each cluster k moves: B v_k, and the response by d_k --------
+    # Errors of different clusters are taken as independent, so their products add up.
     owner = np.repeat(np.arange(px.n_objects), np.diff(px.first))
     alone, reduced = np.zeros((len(owner), NUMBERS)), np.zeros((len(owner), len(schur)))
     leverage = np.zeros(len(owner))
@@ -46,19 +50,26 @@ def sandwich_covariance(
         corrected = _correct_leverage(scores, h, system.inverse, system.coupling, free, owner[part])
         alone[part], reduced[part], leverage[part] = corrected
     moved = reduced @ schur
+
+    # -------- covariance of the response: clusters, priors of the objects, prior of the response (Eq. M.40) --------
     prior_scatter = np.zeros((px.n_objects, NUMBERS, NUMBERS))
     if prior.scatter is not None:
         prior_scatter = np.where(free[:, :, None] & free[:, None, :], prior.scatter, 0.0)
     # Covariance that the prior of each object causes in the response.
     of_priors = schur @ by_response.transpose(0, 2, 1) @ prior_scatter @ by_response @ schur
     total = moved.T @ moved + of_priors.sum(0) + schur @ curve_prior.scatter @ schur
+
+    # -------- covariance of each object: its clusters, its prior, and the response as everything else moves it --------
     out = np.zeros((px.n_objects, NUMBERS, NUMBERS))
     for o in np.flatnonzero(np.diff(px.first)):
         part = slice(px.first[o], px.first[o + 1])
         d = moved[part]
+        # The object's clusters move it directly and through the response. Both movements are added before they are multiplied,
+        # and `others` leaves out what the same clusters and the object's prior do to the response.
         p = alone[part] - d @ by_response[o].T
         both = system.inverse[o] + by_response[o] @ schur @ by_response[o].T
         others = total - d.T @ d - of_priors[o]
+        # Eq. M.39: few clusters say little about their own scatter, so the covariance is enlarged.
         few = (leverage[part] ** 2).sum() / max(leverage[part].sum() ** 2, 1e-100)  # 1 / nu
         out[o] = (1.0 + 0.5 * few) ** 2 * p.T @ p + both @ prior_scatter[o] @ both + by_response[o] @ others @ by_response[o].T
     i = np.arange(NUMBERS)
@@ -74,11 +85,13 @@ def _correct_leverage(
     With B = R R and M = R H_k R, B v_k = R (1 - M)^(-1/2) R u_k. The part of the gradient that belongs to the response gains
     C_k' R g(M) R u_k with g(x) = ((1 - x)^(-1/2) - 1) / x.
     """
+    # R, the symmetric root of B. R H_k R has the eigenvalues of H_k B and is symmetric, so its eigenvectors are orthogonal.
     values, vectors = np.linalg.eigh(inverse)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ vectors.transpose(0, 2, 1)
     own = np.where(free[owner], scores[:, :NUMBERS], 0.0)
     r = root[owner]
     leverage, basis = np.linalg.eigh(r @ h[:, :NUMBERS, :NUMBERS] @ r)
+    # The lower limit keeps g(x) from 0 / 0; H_k of two halves may also have negative eigenvalues.
     leverage = np.clip(leverage, 1e-9, _MAX_LEVERAGE)
     enlarge = 1.0 / np.sqrt(1.0 - leverage)
     inner = np.einsum("kji,kj->ki", basis, np.einsum("kij,kj->ki", r, own))

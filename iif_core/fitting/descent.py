@@ -98,6 +98,8 @@ class Spectrum:
     def inverse(self, damping: np.ndarray | float = 0.0) -> np.ndarray:
         """Return the inverses of the damped blocks; eigenvalues count by their modulus
         (docs/method/numerics.md#indefinite-normal-matrices)."""
+        # The blocks have unit diagonal: the floor bounds their condition, and the damping is relative to the curvature of each
+        # number.
         values = np.maximum(np.abs(self.values), 1e-10) + np.reshape(damping, (-1, 1))
         unit = (self.vectors / values[:, None, :]) @ self.vectors.transpose(0, 2, 1)
         return unit * self.scale[:, :, None] * self.scale[:, None, :]
@@ -111,6 +113,7 @@ class Spectrum:
 def decompose(h: np.ndarray) -> Spectrum:
     """Decompose symmetric blocks (O, k, k)."""
     diagonal = np.abs(np.diagonal(h, axis1=1, axis2=2))
+    # A number that no pixel moves has diagonal 0 and keeps a finite scale (docs/method/numerics.md#black-metal).
     scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-12 * np.maximum(diagonal.max(1, keepdims=True), 1e-100)))
     unit = h * scale[:, :, None] * scale[:, None, :]
     values, vectors = np.linalg.eigh(unit)
@@ -124,6 +127,7 @@ def decompose_objects(h: np.ndarray, free: np.ndarray, prior: GaussianPrior) -> 
     keep = own[:, :, None] & own[:, None, :]
     block = np.where(keep, h[some, :NUMBERS, :NUMBERS] + prior.weight[some], 0.0)
     i = np.arange(NUMBERS)
+    # Fixed numbers get an identity block, so that the whole is invertible and the free numbers do not notice them.
     block[:, i, i] += ~own
     found = decompose(block)
     values, scale = np.ones((2, len(free), NUMBERS))
@@ -158,6 +162,8 @@ class ResponsePrior:
 def make_response_prior(opt: FitOptions, pixels: int, start_params: np.ndarray) -> ResponsePrior:
     """Make the prior of the options, or one around the start with precision 1, weighted by `response_ridge` for each pixel."""
     mean, precision = opt.response_prior or (start_params, np.eye(len(start_params)))
+    # The prior has the gradient weight * precision * (params - mean). An error of the mean of covariance precision^-1 therefore
+    # gives it the covariance weight^2 * precision.
     weight, precision = opt.response_ridge * pixels, np.asarray(precision, np.float64)
     return ResponsePrior(np.asarray(mean, np.float64), weight * precision, weight**2 * precision)
 
@@ -183,6 +189,7 @@ def eliminate_objects(
         The eliminated system; without a response to fit `schur` and `g_w` are 0.
     """
     free = state.free
+    # B_o of Eq. M.17. Rows of fixed numbers become 0, so they do not move and do not enter the response.
     keep = free[:, :, None] & free[:, None, :]
     inverse = np.where(keep, blocks.inverse(state.damping if damped else 0.0), 0.0)
     gradient = terms.g
@@ -194,6 +201,7 @@ def eliminate_objects(
         return Arrowhead(inverse, coupling, np.zeros((size, size)), g, np.zeros(size), by_response)
     h_w = terms.h[:, NUMBERS:, NUMBERS:].sum(0) + curve_prior.precision
     g_w = gradient[:, NUMBERS:].sum(0) + curve_prior.gradient(state.params)
+    # Left side of Eq. M.17. A difference of noisy matrices may be indefinite, hence the same decomposition as for the blocks.
     reduced = h_w - np.einsum("oip,oiq->pq", coupling, by_response)
     schur = decompose(reduced[None]).inverse(state.response_damping if damped else 0.0)[0]
     return Arrowhead(inverse, coupling, schur, g, g_w, by_response)
@@ -245,10 +253,14 @@ def descend(
     refused, taken, settled = 0, 0, False
     floor = len(px.obj) * _NEGLIGIBLE_RESIDUAL**2
     for step in range(most + 1):
+        # -------- is the descent over? (Eq. M.18) --------
         blocks = decompose_objects(terms.h, state.free, prior)
         objects, response = _expected_fall(eliminate_objects(terms, state, prior, curve_prior, fitted, blocks, damped=False))
+        # The moduli of the terms are the scale: with two halves the objective itself may be near 0 or negative. `floor` makes a
+        # perfect fit, whose size is 0, converge (docs/method/numerics.md#objective-near-zero).
         scale = terms.size.sum() + prior.cost(state.affine).sum()
         enough = opt.tolerance * scale + floor
+        # `settled`: the last rounds left every object at rest. At a kink they may still expect to fall.
         if objects + response <= enough or (settled and response <= 0.5 * enough):
             return replace(state, converged=True, reason="the expected fall is below the tolerance"), terms
         if taken >= _STALLED_STEPS and state.history[-1 - _STALLED_STEPS] - total <= opt.tolerance * scale:
@@ -257,6 +269,8 @@ def descend(
             return replace(state, reason=f"{most} steps were allowed"), terms
         if refused >= _REFUSED_STEPS:
             return replace(state, converged=True, reason="no step lowers the objective"), terms
+
+        # -------- a step of objects and response, then objects alone --------
         moves = fitted and response > 0.5 * enough
         moved = _step_everything(px, state, terms, prior, tone, opt, curve_prior, blocks) if moves else None
         if moved is not None:
@@ -264,8 +278,11 @@ def descend(
         elif moves:
             state = replace(state, response_damping=float(_adapt_damping(state.response_damping, False)))
         if moved is None or iterations is None:
+            # A round of the objects alone is cheap: it sums only the pixels of the objects that still move.
             rounds = 1 if iterations is not None else _ROUNDS_BETWEEN_STEPS if moved is not None else _ROUNDS_AT_THE_END
             state, settled = _step_objects(px, state, terms, prior, tone, opt, rounds)
+
+        # -------- did the objective fall by more than its rounding? --------
         new_total = total_of(terms.cost, state.affine, state.params)
         fell = new_total < total - 1e-15 * abs(total)
         refused, taken = (0, taken + 1) if fell else (refused + 1, taken)
@@ -293,6 +310,8 @@ def _step_everything(
 ) -> tuple[DescentState, Terms, Tone] | None:
     """Take one step of objects and response; objects whose cost it does not lower stay. None: the objective did not fall."""
     system = eliminate_objects(terms, state, prior, curve_prior, True, blocks)
+    # Right side of Eq. M.17. `tone.at` projects the limited step into the range in which the curve is monotone; the objects
+    # follow the shift that is left of it.
     right = -system.g_w + np.einsum("oip,oi->p", system.by_response, system.g)
     new_tone = tone.at(state.params + (system.schur @ right).clip(-0.5, 0.5))
     params = new_tone.response.params.ravel()
@@ -304,10 +323,12 @@ def _step_everything(
     stay = terms.cost + terms.g[:, NUMBERS:] @ shift + 0.5 * terms.h[:, NUMBERS:, NUMBERS:] @ shift @ shift
     better = go.cost + prior.cost(tried) < stay + prior.cost(state.affine)
     affine = np.where(better[:, None], tried, state.affine)
+    # Objects that stay have another cost and system under the new response.
     left = np.flatnonzero(~better)
     if len(left):
         go.update(evaluate(px, affine, new_tone, opt, True, state.free, left), left)
     gained = (go.cost + prior.cost(affine) - terms.cost - prior.cost(state.affine)).sum() + curve_prior.cost(params)
+    # Change of the objective; written so that NaN counts as no fall.
     if not gained < curve_prior.cost(state.params):
         return None
     damping, mu = _adapt_damping(state.damping, better), float(_adapt_damping(state.response_damping, True))
@@ -327,6 +348,7 @@ def _step_objects(
     whole = terms.size.sum() + prior.cost(affine).sum()
     active = np.flatnonzero(state.free.any(1))
     for _ in range(rounds):
+        # -------- expected fall of each object with the response held; those below the tolerance rest --------
         own, free = prior.only(active), state.free[active]
         keep = free[:, :, None] & free[:, None, :]
         blocks = decompose_objects(terms.h[active], free, own)
@@ -338,10 +360,13 @@ def _step_objects(
         if not hopeful.any():
             return replace(state, affine=affine, damping=damping), True
         delta = np.einsum("oij,oj->oi", np.where(keep, blocks.inverse(damping[active]), 0.0), g)
+        # Fall that the quadratic model predicts for the damped step -delta.
         promised = np.einsum("oi,oi->o", g, delta) - 0.5 * blocks.form(delta)
         tried = affine.copy()
         tried[active] -= delta
         active, here, little, promised = active[hopeful], here[hopeful], little[hopeful], promised[hopeful]
+
+        # -------- each object takes or refuses its step --------
         go = evaluate(px, tried, tone, opt, True, state.free, active)
         gained = terms.cost[active] + here - go.cost[active] - prior.only(active).cost(tried[active])
         better = gained > 0
@@ -351,6 +376,7 @@ def _step_objects(
         kept = better & (gained < _POOR_GAIN * promised)  # at a kink, a longer step would be refused
         damping[active] = np.where(kept, damping[active], _adapt_damping(damping[active], better))
         gains.append(float(gained[better].sum()))
+        # Six refused steps in a row, or three that gain little, put an object to rest.
         idle[active] = np.where(gained > little, 0, idle[active] + np.where(better, _REFUSED_STEPS // _STALLED_STEPS, 1))
         active = active[idle[active] < _REFUSED_STEPS]
         if not len(active) or (len(gains) >= _REFUSED_STEPS and sum(gains[-_REFUSED_STEPS:]) <= opt.tolerance * whole):

@@ -98,6 +98,7 @@ def fit_affines(problem: FitProblem, response: Response, options: FitOptions | N
     opt = options or FitOptions()
     everything, tone = prepare_pixels(problem, response, opt.min_pixels, MAX_PIXELS_PER_OBJECT)
     texture_of_all = measure_texture(everything, opt)
+    # Only objects with enough pixels take part, numbered anew; `result_of` puts them back among all objects.
     members = np.flatnonzero(texture_of_all.enough)
     px, texture = everything.only(members), texture_of_all.only(members)
     start_params = response.params.ravel().astype(np.float64) if tone.size else np.zeros(0)
@@ -121,8 +122,12 @@ def _descend_all(
     """Select the kinds, learn the population, and descend on all pixels."""
     if opt.select and opt.lobes:
         fit = _select_kinds(px, fit, tone, texture, opt, start_params)
+
+    # -------- population, both estimates of each level, and light: two rounds (Eq. M.26 to M.36) --------
     if opt.population:
         some = px.take(choose_evenly(px.obj, px.offsets, POPULATION_PIXELS))
+        # `weigh_by_halves` replaces targets, and the gain of the light is that on the light as it was given. Both rounds
+        # therefore start from the measured targets and the given exposure.
         measured, roughness = some.target, texture.mean[:, 3]
         exposure, light_gain = some.exposure, np.ones(some.n_objects)
         for _ in range(2):
@@ -144,8 +149,12 @@ def _descend_all(
             prior.centre[np.ix_(bounded, GAINS)] = gain_of_the_rest(levels, state.affine)[0]
             fit = replace(fit, prior=prior)
         px.exposure = px.exposure * light_gain[px.obj]
+
+    # -------- all pixels --------
     measured = px.target
     if not opt.population:
+        # Weights and targets depend on the numbers, so a short descent comes first. With a population, the two rounds have done
+        # this.
         weigh_by_halves(px, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.response_weight)
         state, _ = descend(px, fit.state, fit.prior, tone, opt, WARM_START_STEPS, start_params)
         fit = replace(fit, state=state)
@@ -174,11 +183,14 @@ def weigh_by_halves(
         return
     px.target = measured
     errors = residuals(px, affine, tone, opt)
+    # d of Eq. M.12; the limit keeps the square of a firefly finite (docs/method/numerics.md#fireflies).
     apart = 0.5 * np.minimum(np.abs(errors[:, 0] - errors[:, 1]), 1e6)
     trust = 1.0 / (1.0 + (apart / (3.0 * opt.robust_width)) ** 2)
     px.trust = np.ascontiguousarray(trust * np.repeat(own, px.counts)[:, None], px.trust.dtype)
+    # Value of the curve at the mean prediction, where Eq. M.13 takes its ratio.
     shown = measured + errors.mean(1)
     bias = tone.curvature_ratio(shown) * np.minimum(apart, opt.robust_width) ** 2
+    # A bound would take the lower side of the noise for a violation, so it is lowered by 3 d and not shifted.
     bias = np.where(px.saturated, 0.0, np.clip(bias, -LARGEST_BIAS * np.abs(measured), LARGEST_BIAS * np.abs(measured)))
     px.target = np.ascontiguousarray(np.where(px.saturated, measured - 3.0 * apart, measured + bias), measured.dtype)
 
@@ -190,6 +202,7 @@ def hold_given(affine: np.ndarray, free: np.ndarray, metallic: np.ndarray, given
         return
     for column, (numbers, value) in enumerate(zip((ROUGHNESS, METALLIC), given.T, strict=True)):
         known = ~np.isnan(value)
+        # A known value x is gain 0 and bias x: the same over the whole object.
         held = np.stack([np.zeros(known.sum()), value[known]], 1)
         affine[np.ix_(known, numbers)] = held
         free[np.ix_(known, numbers)] = False
@@ -202,8 +215,10 @@ def _start(px: Pixels, texture: Texture, params: np.ndarray, opt: FitOptions, gi
     n = px.n_objects
     free = texture.albedo_numbers()
     if opt.select or opt.population:
+        # Selection starts from dielectrics of the population's roughness; both stay fixed until kinds are chosen.
         metallic = np.tile(KINDS[0] if opt.select else [1.0, 0.0], (n, 1))
         population = initial_population()
+        # No scatter was measured yet: a standard deviation of a row of 0.01 at the default robust width.
         noise = np.full(n, (0.05 * opt.robust_width + 0.005) ** 2 if len(px.obj) else 1.0)
         prior = population_prior(population, noise, texture.mean[:, 3], metallic)
         affine = prior.centre.copy()
@@ -215,6 +230,7 @@ def _start(px: Pixels, texture: Texture, params: np.ndarray, opt: FitOptions, gi
         weight = np.einsum("o,i,ij->oij", px.counts.astype(np.float64), opt.ridge * RIDGE_OF_NUMBER, np.eye(NUMBERS))
         prior = GaussianPrior(affine.copy(), weight)
     if not opt.select:
+        # Without selection, roughness is free everywhere and metallic where the predictions suggest it.
         metal = texture.enough & (texture.mean[:, 4] > opt.metallic_prior)
         free[:, 12], free[:, 13] = texture.enough & texture.varied[:, 0], texture.enough
         free[:, 14], free[:, 15] = metal & texture.varied[:, 1], metal
@@ -230,6 +246,7 @@ def _select_kinds(
     px: Pixels, fit: FitProgress, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray
 ) -> FitProgress:
     """Choose kind and roughness of every object on a few of its pixels; then free the numbers of that kind."""
+    # -------- a first descent, which gives response and variance of a row --------
     few = px.take(choose_evenly(px.obj, px.offsets, SELECTION_PIXELS))
     weigh_by_halves(few, few.target, fit.state.affine, tone, opt)
     # Bounds alone cannot tell one local minimum from another.
@@ -237,12 +254,17 @@ def _select_kinds(
     state, _ = descend(few, fit.state, fit.prior, tone, opt, WARM_START_STEPS, start_params)
     terms = evaluate(few, state.affine, tone.at(state.params), opt, True, state.free, scores=True)
     noise = row_variance(terms, few, state.free)
+
+    # -------- profile and choice --------
     prior = population_prior(initial_population(), noise, texture.mean[:, 3], fit.metallic)
     found = profile_roughness(few, state, prior, tone.at(state.params), opt, state.free, measured & texture.mixed)
     choice = choose_kinds(found, measured, texture.mean, px.usable, fit.given, opt.prediction_errors)
+
+    # -------- numbers, free ones and prior of the chosen kind --------
     metallic = KINDS[choice.kind].copy()
     affine = found.affine[np.arange(px.n_objects), choice.kind, choice.at].copy()
     affine[:, 12:] = np.concatenate([np.zeros((px.n_objects, 1)), choice.roughness[:, None], metallic], 1)
+    # Objects without evidence stay where the first descent left them.
     affine = np.where(measured[:, None], affine, state.affine)
     free = state.free.copy()
     free[:, 13] = measured
@@ -263,25 +285,33 @@ def _profile_errors(
     few: Pixels, state: DescentState, prior: GaussianPrior, tone: Tone, opt: FitOptions, noise: np.ndarray, choice: Choice
 ) -> ProfiledRoughness:
     """Find error and derivative by the response of each profiled roughness, albedo numbers eliminated (Eq. M.30, M.31)."""
+    # -------- curvature in r and coupling to the response, albedo eliminated (Eq. M.30) --------
+    # Number 13 is h_r, the bias of the roughness; a change of it is a change of r at every pixel. `row` is H_ra B_aa.
     albedo = state.free & (np.arange(NUMBERS) < 12)
     terms = evaluate(few, state.affine, tone.at(state.params), opt, True, scores=True)
     inverse = np.where(albedo[:, :, None] & albedo[:, None, :], decompose_objects(terms.h, albedo, prior).inverse(), 0.0)
     h, c = terms.h[:, 13, :NUMBERS], terms.h[:, :, NUMBERS:]
     row = np.einsum("oi,oij->oj", h, inverse)
     coupling = c[:, 13] - np.einsum("oi,oip->op", row, c[:, :NUMBERS])
+    # `precision` is V of Eq. M.30, `total` is h + V, `share` the part h / (h + V) that the pixels have in the profiled roughness.
     width = max(choice.population[1], LEAST_ROUGHNESS_DEVIATION)
     precision = EVIDENCE_DISCOUNT * noise / width**2
     curvature = np.maximum(h[:, 13] - (row * h).sum(1), 0.0)
     total = curvature + precision
     share = 1.0 - precision / total
+
+    # -------- error of the profiled roughness (Eq. M.31) --------
     clusters = np.diff(few.first)
     owner = np.repeat(np.arange(few.n_objects), clusters)
+    # Score of each cluster in r with the albedo eliminated, around the mean of its object.
     own = terms.scores[:, 13] - np.einsum("ki,ki->k", row[owner], terms.scores[:, :NUMBERS])
     own -= (np.bincount(owner, own, few.n_objects) / np.maximum(clusters, 1))[owner]
-    # The variance of a row that matters here is that of the direction of roughness.
+    # Variance of a row in the direction of roughness, which the profiled roughness depends on; at most the variance of all.
     squares = np.bincount(owner, own**2, few.n_objects) * clusters / np.maximum(clusters - 1, 1)
     scatter = np.minimum(squares / np.maximum(curvature, 1e-12 * total), noise)
     spacing = 2.0 * LEAST_ROUGHNESS_DEVIATION
+    # Rounding to a grid is a sawtooth. Its first harmonic has the amplitude spacing / pi, 0.225 spacing in the root mean square.
+    # Averaging over a posterior of the width `deviation` damps it by the exponential.
     grid = 0.225 * spacing * np.exp(-2.0 * (np.pi * choice.deviation / spacing) ** 2)
     error = np.sqrt(share * scatter / total + ((1.0 - share) * width) ** 2 + grid**2)
     d_level_d_response = np.where(state.free[:, 13:14], -coupling / total[:, None], 0.0)
@@ -289,7 +319,7 @@ def _profile_errors(
 
 
 def _make_prior(fit: FitProgress, noise: np.ndarray, roughness: np.ndarray) -> GaussianPrior:
-    """Make the prior of the population; the roughness of profiled objects is moved to the response of today (Eq. M.29).
+    """Make the prior of the population; the roughness of profiled objects is moved to the current response (Eq. M.29).
 
     A descent sees one local minimum and its slope, the profile saw all of them."""
     assert fit.population is not None
@@ -298,6 +328,7 @@ def _make_prior(fit: FitProgress, noise: np.ndarray, roughness: np.ndarray) -> G
     if seen is None:
         return prior
     deviation = np.clip(seen.deviation, LEAST_ROUGHNESS_DEVIATION, population.spread[3])
+    # The stored level belongs to the response of the profile; Eq. M.29 carries it to the current one.
     level = np.clip(seen.level + seen.d_level_d_response @ (fit.state.params - seen.params), R_MIN, 1.0)
     seen = replace(seen, level=level, deviation=deviation, params=fit.state.params)
     return with_profiled_roughness(prior, seen, noise, roughness, population.contrast, EVIDENCE_DISCOUNT)
@@ -327,17 +358,23 @@ def result_of(
         identity without one; their albedo is that of the base at the level that the others have relative to it.
     """
     state, n_objects = fit.state, len(counts)
+
+    # -------- objects that were not fitted --------
     affine, free = np.tile(IDENTITY, (n_objects, 1)), np.zeros((n_objects, NUMBERS), bool)
     covariance, residual = np.zeros((n_objects, NUMBERS, NUMBERS)), np.zeros(n_objects)
     if fit.population is not None and len(members):
         affine[:] = population_mean(fit.population, np.zeros(1), KINDS[:1])
+        # A dielectric of one roughness, the population's mean.
         affine[:, 12] = 0.0
         affine[:, 13] = affine[:, 13] if opt.lobes else np.maximum(affine[:, 13], MATTE_ROUGHNESS)
         spread = fit.population.spread[0]
         if fit.levels is not None:
             affine[:, GAINS], spread = gain_of_the_rest(fit.levels, state.affine)
+        # The three gains err together, by one factor: a covariance of rank one.
         albedo = np.where(np.isin(np.arange(NUMBERS), GAINS), affine, 0.0)
         covariance[:] = (spread * albedo)[:, :, None] * (spread * albedo)[:, None, :]
+
+    # -------- fitted objects: covariance (Eq. M.37 to M.40) and residual --------
     affine[members], free[members] = state.affine, state.free
     final, of_response = tone.at(state.params), np.zeros((tone.size, tone.size))
     spectrum: Spectrum | None = None
@@ -346,13 +383,16 @@ def result_of(
         fitted = bool(opt.free_response and tone.size)
         prior = fit.prior
         if fit.levels is not None:
+            # The error of the light acts on the gradient like an error of the prior's centre does.
             by_light = light_scatter(fit.levels, terms.h[:, :NUMBERS, :NUMBERS], state.affine)
             prior = replace(prior, scatter=by_light if prior.scatter is None else prior.scatter + by_light)
         blocks = spectrum = decompose_objects(terms.h, state.free, fit.prior)
         curve_prior = make_response_prior(opt, len(px.obj), start_params)
+        # Undamped: the covariance is a matter of the curvature alone.
         system = eliminate_objects(terms, state, fit.prior, curve_prior, fitted, blocks, damped=False)
         covariance[members], of_response = sandwich_covariance(px, state, system, prior, curve_prior, final, opt)
         errors = residuals(px, state.affine, final, opt).mean(1)
+        # Bounds are no measurements, so they are in neither sum.
         errors[px.saturated] = 0.0
         square = px.sum_by_object((np.minimum(np.abs(errors), 1e6) ** 2).sum(1))
         residual[members] = np.sqrt(square / np.maximum(px.sum_by_object((~px.saturated).sum(1)), 1))

@@ -14,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 PIECE = 64
+"""Pixels whose Jacobian columns are held together (`_Piece`)."""
+# Reassociation lets the compiler turn a sum over pixels into vector sums. Without `nnan` and `ninf`, a sum that is not finite
+# stays so, and the comparisons that accept a step refuse it.
 _MATHS = {"reassoc", "contract", "nsz", "arcp"}
 _compiled = numba.njit(nogil=True, cache=True, fastmath=_MATHS)
 # Functions that other loops call are inlined: docs/method/numerics.md#sums-that-depend-on-the-compiler.
@@ -60,7 +63,7 @@ class ResponseTables(NamedTuple):
     by_params: NDArray
     """(3, N + 1, q) derivatives of f by the parameters."""
     per_channel: bool
-    """Each channel has parameters of its own."""
+    """Each channel has its own parameters."""
 
 
 class Penalties(NamedTuple):
@@ -117,6 +120,8 @@ class _Piece(NamedTuple):
 
 @_inlined
 def _inner(left, right, h_left, h_right):
+    # Slope at an inner level (Eq. M.5): weighted harmonic mean of both chords. It is 0 at an extremum, where the cubic would
+    # overshoot otherwise.
     if left * right <= 0.0:
         return 0.0
     w_left = 2.0 * h_right + h_left
@@ -126,7 +131,10 @@ def _inner(left, right, h_left, h_right):
 
 @_inlined
 def _end(mean, beyond, h, h_beyond):
+    # Slope at an outermost level: derivative of the parabola through three levels. `mean` is the chord of the outermost interval,
+    # `beyond` the chord of the next one.
     slope = ((2.0 * h + h_beyond) * mean - h * beyond) / (h + h_beyond)
+    # A slope against the chord, or steeper than three chords, could take the cubic out of the range of its two values.
     if slope * mean <= 0.0:
         return 0.0
     if abs(slope) > 3.0 * abs(mean):
@@ -141,6 +149,7 @@ def slopes(shading, levels, out):
     for p in range(len(shading)):
         for c in range(3):
             for j in range(last + 1):
+                # Chords in float64: neighbouring levels differ by little, and the cache may be float32.
                 y = float(shading[p, j, c])
                 left = 0.0
                 right = 0.0
@@ -154,6 +163,7 @@ def slopes(shading, levels, out):
                     right = (shading[p, j + 1, c] - y) / h_right
                 if j > 0 and j < last:
                     out[p, j, c] = _inner(left, right, h_left, h_right)
+                # Two levels: the missing chord is 0, so this is the slope of a straight line.
                 elif last == 1:
                     out[p, j, c] = left + right
                 elif j == 0:
@@ -167,6 +177,8 @@ def slopes(shading, levels, out):
 @_inlined
 def _interpolation_weights(levels, r):
     """Return the level below r, and the weights of y0, y1, y0', y1' in value and slope there (Eq. M.4)."""
+    # Index and t are held inside the levels, so a roughness that rounding moved outside reads the nearest level
+    # (docs/method/numerics.md#roughness-outside-the-cached-levels).
     last = len(levels) - 2
     j = 0
     while j < last and r >= levels[j + 1]:
@@ -175,6 +187,8 @@ def _interpolation_weights(levels, r):
     t = min(max((r - levels[j]) / span, 0.0), 1.0)
     left = 1.0 - t
     steep = 6.0 * t * left / span
+    # Hermite's form of Eq. M.4. At t = 0 and t = 1 one weight is exactly 1 and the others are 0, so the levels come back
+    # unchanged.
     value = (left * left * (1.0 + 2.0 * t), t * t * (3.0 - 2.0 * t), span * t * left * left, -span * t * t * left)
     return j, value, (-steep, steep, (1.0 - t) * (1.0 - 3.0 * t), t * (3.0 * t - 2.0))
 
@@ -185,6 +199,7 @@ def _interpolate_lobes(nodes, j, w, out):
     w0, w1, v0, v1 = w
     y0, y1 = nodes[j, 0], nodes[j + 1, 0]
     d0, d1 = nodes[j, 1], nodes[j + 1, 1]
+    # One set of weights serves all 6 h columns, which lie next to each other: a vector loop.
     for k in range(len(out)):
         out[k] = w0 * y0[k] + w1 * y1[k] + v0 * d0[k] + v1 * d1[k]
 
@@ -193,22 +208,27 @@ def _interpolate_lobes(nodes, j, w, out):
 def _apply_curve(x, knee, gain, curve, end):
     """Return f, df/dx, and node and share of the table at x."""
     if knee > 0.0:
+        # Linear photographs: Eq. M.3 in closed form. The curve has no parameters, so node and share do not matter.
         x = max(x, 0.0)
         return gain * np.log1p(x / knee), gain / (knee + x), 0, 0.0
     last = len(curve) - 1
     if x >= 1.0:
+        # Above white, the straight line of Eq. C.16 keeps a gradient where the prediction is too bright. The share is x - 1.
         return curve[last, 0] + end * (x - 1.0), end, last, x - 1.0
+    # The nodes are evenly spaced in u = x^(1/4). Response curves behave like powers near 0: steep in x, smooth in u.
     root = np.sqrt(max(x, 0.0))
     u = np.sqrt(root)
     at = u * last
     i = min(int(at), last - 1)
     t = at - i
     h = 1.0 / last
+    # Cubic of Eq. M.4 between two nodes, in u. `bend0` and `bend1` are df/du at the nodes minus the chord.
     mean = (curve[i + 1, 0] - curve[i, 0]) * last
     bend0 = curve[i, 1] - mean
     bend1 = curve[i + 1, 1] - mean
     f = curve[i, 0] + h * t * (mean + (1.0 - t) * ((1.0 - t) * bend0 - t * bend1))
     du = mean + (1.0 - t) * (1.0 - 3.0 * t) * bend0 + t * (3.0 * t - 2.0) * bend1
+    # df/dx = df/du / (4 u^3); the floor keeps it finite at x = 0 (docs/method/numerics.md#pow-at-zero).
     return f, du / max(4.0 * root * u, 1e-12), i, t
 
 
@@ -235,6 +255,8 @@ def sums(
     """
     h = out.h
     per = tone.by_params.shape[2]
+    # A channel depends on eight numbers of its object (its row of [A | b], gain and bias of roughness and of metallic) and on
+    # `per` parameters of the response. The columns have the type of the cache, float32 or float64.
     width, kind = 8 + per, pixels.lobes.dtype
     layout = _Columns(np.zeros((3, width), np.int64), np.zeros((3, width), np.int64), np.zeros(3, np.int64))
     columns, error = np.zeros((2, 3, width, PIECE), kind), np.zeros((2, 3, PIECE), kind)
@@ -251,6 +273,7 @@ def sums(
         out.data[o] = data
         out.size[o] = size
         if system:
+            # `_add_piece` and `_add_range_curvature` fill the upper triangle alone.
             for i in range(h.shape[1]):
                 for j in range(i):
                     h[o, i, j] = h[o, j, i]
@@ -262,6 +285,9 @@ def _choose_columns(free, per, per_channel, layout):
     for c in range(3):
         layout.used[c] = 0
         for i in range(8 + per):
+            # Row of the system: the channel's row of [A | b] is 4 c to 4 c + 3, roughness and metallic are 12 to 15. The response
+            # follows, in one block for all channels or one block each. `at` increases with i, so columns i <= j belong to the
+            # upper triangle.
             at = 4 * c + i if i < 4 else (8 + i if i < 8 else 8 + i + (c * per if per_channel else 0))
             if i >= 8 or free[at]:
                 layout.kind[c, layout.used[c]] = i
@@ -275,24 +301,31 @@ def _sum_object(pixels, tone, penalties, t, o, want, layout, piece, out):
     data term, and the sum of its moduli."""
     base, diffuse, lobes, levels, target = pixels.base, pixels.diffuse, pixels.lobes, pixels.levels, pixels.target
     exposure, saturated, trust, starts = pixels.exposure, pixels.saturated, pixels.trust, pixels.starts
+    # Where no system is wanted, h and g are views into empty arrays and stay untouched.
     curve, ends, h, g = tone.curve, tone.ends, out.h[o], out.g[o]
     columns, weight, error, kind, used = piece.columns, piece.weight, piece.error, layout.kind, layout.used
     c2 = penalties.robust_width * penalties.robust_width
     halves, per = diffuse.shape[1], tone.by_params.shape[2]
+    # With a single half both residuals are the same one, and their product is its square.
     last_half = halves - 1
+    # Of one pixel: the clamped material, its distance beyond the allowed range, and 1.0 where it lies within. Next: the
+    # derivatives of one residual by eight numbers, and the lobes with their slopes in r, ordered as in `lobes`.
     value, beyond, is_free = np.zeros(5), np.zeros(5), np.zeros(5)
     slope_at, lobe, lobe_slope = np.zeros(8), np.zeros(lobes.shape[3]), np.zeros(lobes.shape[3])
     system = want == 1 or want == 2
     cost = data = size = 0.0
-    k = pixels.first[o]
+    k = pixels.first[o]  # cluster of the current pixel
     end = starts[pixels.first[o + 1]]
     begin = starts[k]
     while begin < end:
         stop = min(begin + PIECE, end)
         m_pixels = stop - begin
+
+        # -------- material, range term and lobes of each pixel of the piece --------
         k_begin = k
         for q in range(m_pixels):
             p = begin + q
+            # Clusters may be empty (`Pixels.take` keeps all of them), so several may end here.
             while p >= starts[k + 1]:
                 k += 1
             b = base[p]
@@ -302,12 +335,15 @@ def _sum_object(pixels, tone, penalties, t, o, want, layout, piece, out):
                 _add_range_curvature(h, b, penalties.box, beyond)
                 if want == 2:
                     _add_material_slopes(out.scores[k], b, penalties, beyond, is_free)
+            # All channels and halves share the roughness, so one search for the level serves the whole pixel.
             j, of_value, of_slope = _interpolation_weights(levels, value[3])
             _interpolate_lobes(lobes[p], j, of_value, lobe)
             if system:
                 _interpolate_lobes(lobes[p], j, of_slope, lobe_slope)
             e = exposure[p]
             m = value[4]
+
+            # -------- prediction, residual and slopes of one channel in each half --------
             for c in range(3):
                 a = value[c]
                 ks = 0.04 * (1.0 - m) + m * a
@@ -315,9 +351,12 @@ def _sum_object(pixels, tone, penalties, t, o, want, layout, piece, out):
                     d = float(diffuse[p, half, c])
                     s0 = lobe[6 * half + c]
                     s1 = lobe[6 * half + 3 + c]
+                    # e L (Eq. M.1), exposed radiance: an 8-bit photograph is white from 1 on.
                     x_shown = e * ((1.0 - m) * a * d + ks * s0 + s1)
                     f, df, node, part = _apply_curve(x_shown, tone.knee, tone.gain, curve[c], ends[c, 0])
                     left = f - target[p, c]
+                    # A saturated value bounds the prediction from below: above the bound, residual and slope are 0 (Eq. M.6,
+                    # M.9). Where the value is not saturated, a prediction that is too bright keeps its slope.
                     idle = saturated[p, c] and left > 0.0
                     if idle:
                         left = 0.0
@@ -325,27 +364,35 @@ def _sum_object(pixels, tone, penalties, t, o, want, layout, piece, out):
                     if want == 3:
                         out.errors[p, half, c] = left
                     if system:
+                        # zeta of Eq. M.10. The derivatives by the material are 0 where a value is clamped.
                         slope = 0.0 if idle else df * e
                         da = slope * ((1.0 - m) * d + m * s0) * is_free[c]
                         dr = slope * (ks * lobe_slope[6 * half + c] + lobe_slope[6 * half + 3 + c]) * is_free[3]
                         dm = slope * (-a * d + (a - 0.04) * s0) * is_free[4]
                         _write_slopes(slope_at, b, da, dr, dm)
+                        # The free numbers of the object have the first columns, the response the last `per`.
                         own = used[c] - per
                         for i in range(own):
                             columns[half, c, i, q] = slope_at[kind[c, i]]
                         for i in range(per):
                             columns[half, c, own + i, q] = 0.0 if idle else _by_param(tone, c, node, part, i)
+
+                # -------- loss and weight of the pair of halves (Eq. M.7, M.8) --------
                 # The loss is odd in the product. If only positive products were damped, large noise of opposite signs would pay,
                 # and the response would be bent until it amplifies the noise.
                 product = float(error[0, c, q]) * float(error[last_half, c, q])
                 modulus = abs(product)
                 rho = 0.5 * trust[p, c] * c2 * np.log1p(modulus / c2)
+                # Moduli: `data` may be near 0 or negative with two halves, and would be no scale for a tolerance.
                 size += rho
                 data += rho if product >= 0.0 else -rho
                 weight[c, q] = trust[p, c] / (1.0 + modulus / c2)
+
+        # -------- sums over the piece --------
         if system:
             _add_piece(piece, last_half, m_pixels, layout, h, g)
         if want == 2:
+            # Pixels low_q to high_q - 1 of the piece belong to cluster y, which may begin before the piece or end behind it.
             low_q = 0
             for y in range(k_begin, k + 1):
                 high_q = min(starts[y + 1] - begin, m_pixels)
@@ -361,20 +408,24 @@ def _clamp(b, t, penalties, value, beyond, is_free, cost):
     within. Returns `cost` plus the terms of the objective that depend on the material alone (Eq. M.11, M.45)."""
     for i in range(5):
         if i < 3:
+            # Row i of [A | b] applied to the base albedo (Eq. R.14).
             raw = t[4 * i] * b[0] + t[4 * i + 1] * b[1] + t[4 * i + 2] * b[2] + t[4 * i + 3]
         else:
             raw = t[6 + 2 * i] * b[i] + t[7 + 2 * i]
+        # The albedo may exceed 1 during the fit, because the level of the light is not known that well (`FitOptions.brightest`).
         value[i] = min(max(raw, 0.02 if i == 3 else 0.0), penalties.brightest if i < 3 else 1.0)
         beyond[i] = raw - value[i]
         is_free[i] = 1.0 if beyond[i] == 0.0 else 0.0
         if beyond[i] != 0.0:
             cost += 0.5 * penalties.box * beyond[i] * beyond[i]
+    # The objective sums half the squares of three channels: 3 / 2 times their mean, to which the weights of Eq. M.45 refer.
     return cost + 1.5 * (penalties.roughness_weight * (1.0 - value[3]) + penalties.metallic_weight * value[4])
 
 
 @_inlined
 def _add_material_slopes(g, b, penalties, beyond, is_free):
     """Add the gradient of the terms that depend on the material alone."""
+    # Where a value is clamped, the range term alone has a slope; it leads the value back.
     for i in range(5):
         if beyond[i] != 0.0:
             _add_slope(g, i, b, penalties.box * beyond[i])
@@ -402,6 +453,7 @@ def _add_range_curvature(h, b, box, beyond):
     for i in range(5):
         if beyond[i] == 0.0:
             continue
+        # Curvature of 0.5 box beyond^2: box times the outer product of (b, 1), upper triangle alone.
         if i < 3:
             for x in range(4):
                 bx = b[x] if x < 3 else 1.0
@@ -432,6 +484,7 @@ def _write_slopes(slope_at, b, da, dr, dm):
 def _by_param(tone, c, node, part, i):
     """Derivative of f by parameter i of channel c, at share `part` behind a node of the table."""
     if node == tone.curve.shape[1] - 1:
+        # Above white the parameters also turn the straight line of Eq. C.16; `part` is x - 1.
         return tone.by_params[c, node, i] + part * tone.ends[c, 1 + i]
     return (1.0 - part) * tone.by_params[c, node, i] + part * tone.by_params[c, node + 1, i]
 
@@ -466,6 +519,7 @@ def _add_piece(piece, last_half, m, layout, h, g):
         e1 = error[0, c]
         e2 = error[last_half, c]
         for i in range(used[c]):
+            # W J1 and W J2 of column i serve all columns j >= i.
             for q in range(m):
                 weighted[0, q] = w[q] * one[i, q]
                 weighted[1, q] = w[q] * two[i, q]
@@ -475,6 +529,7 @@ def _add_piece(piece, last_half, m, layout, h, g):
             g[place[c, i]] += 0.5 * total
             for j in range(i, used[c]):
                 total = none
+                # With one half both products of Eq. M.8 are the same, so one of them replaces their mean.
                 if last_half == 0:
                     for q in range(m):
                         total += weighted[0, q] * one[j, q]
@@ -512,6 +567,7 @@ def gradient(pixels: PixelArrays, tone: ResponseTables, penalties: Penalties, af
                 raw = t[4 * i] * b[0] + t[4 * i + 1] * b[1] + t[4 * i + 2] * b[2] + t[4 * i + 3]
             else:
                 raw = t[6 + 2 * i] * b[i] + t[7 + 2 * i]
+            # This optimiser clamps albedos at 1 and has no range term (Eq. M.11), so a clamped value has no gradient.
             value[i] = min(max(raw, 0.02 if i == 3 else 0.0), 1.0)
             is_free[i] = 1.0 if raw == value[i] else 0.0
         r = value[3]
@@ -520,6 +576,7 @@ def gradient(pixels: PixelArrays, tone: ResponseTables, penalties: Penalties, af
         _interpolate_lobes(lobes[p], j, of_value, lobe)
         _interpolate_lobes(lobes[p], j, of_slope, lobe_slope)
         e = pixels.exposure[p]
+        # All channels share roughness and metallic: their slopes are added up and applied after the loop.
         slope_r = -penalties.roughness_weight
         slope_m = penalties.metallic_weight
         for c in range(3):
@@ -532,6 +589,7 @@ def gradient(pixels: PixelArrays, tone: ResponseTables, penalties: Penalties, af
             error = f - target[p, c]
             if saturated[p, c] and error > 0.0:
                 continue
+            # Derivative of error^2 / 3, because Eq. M.45 takes the mean over the channels.
             by_value = 2.0 / 3.0 * error
             slope = by_value * df * e
             da = slope * ((1.0 - m) * d + m * s0) * is_free[c]

@@ -2,7 +2,7 @@
 (docs/method/fitting.md#two-estimates-of-a-level).
 
 The photographs know the brightness of an object up to the error of the light there, the base up to the error of the predictions.
-Both errors are learnt from the scene, unless the prior states that of the base. What the light is believed to err by is taken out
+Both errors are learnt from the scene, unless the prior states how it errs. What the light is believed to err by is taken out
 of it before the last descent.
 """
 
@@ -21,7 +21,7 @@ from iif_core.reflectance.material import BIASES, NUMBERS
 _LARGEST_STEP = 1.5
 """Largest logarithm of a ratio that one linear step may report."""
 _PSEUDO_PATCHES = 4.0
-"""Weight of the room's error of light in that of an object, in patches."""
+"""Weight of the room's error of light in the error of an object, in patches."""
 _BASE_FACTOR, _BASE_FACTORS, _BASE_FACTOR_WIDTH = 1.4, np.geomspace(0.3, 6.0, 15) / 1.4, 0.4
 """The factor that is usual between the error of the base and the scatter of the predictions; values relative to it among which it
 is sought; width (of the logarithm) of its prior."""
@@ -106,12 +106,15 @@ def prediction_scatter(
     """
     n = len(mean_base)
     base = np.maximum(mean_base, _DARKEST_LEVEL)[object_of_segment]
+    # (S, K, 3): mean base albedo through the map that corrects each prediction to the base (Eq. M.33).
     moved = np.einsum("skci,si->skc", affine[..., :3], base) + affine[..., 3]
     if not len(affine):
         return np.full(n, UNKNOWN_SCATTER)
+    # A map that brightens corrects a prediction that is too dark, hence the sign.
     away = -np.log(np.clip(moved.sum(2) / base.sum(1)[:, None], 0.2, 5.0))
     own, used = np.repeat(object_of_segment, affine.shape[1]), np.repeat(weight > 0, affine.shape[1])
     own, away = own[used], away.ravel()[used]
+    # Quartiles of each object: sorted within the object, read at a quarter and three quarters of its count.
     order = np.lexsort((away, own))
     own, away = own[order], away[order]
     count = np.bincount(own, minlength=n)
@@ -146,24 +149,35 @@ def measure_levels(
     """
     n = px.n_objects
     base = np.maximum(np.asarray(mean_base, np.float64), _DARKEST_LEVEL)
+
+    # -------- direction in which the brightness of a channel changes --------
+    # `level` (O, 3) is the fitted albedo of the mean base colour. Multiplying a channel's row of [A | b] by s multiplies its
+    # albedo by s, so the derivative of the numbers by ln s is the row itself.
     linear = affine[:, :12].reshape(n, 3, 4)[:, :, :3]
     level = np.maximum(np.einsum("oci,oi->oc", linear, base) + affine[:, BIASES], _DARKEST_LEVEL)
     rows = np.zeros((n, 3, NUMBERS))
     for c in range(3):
         rows[:, c, 4 * c : 4 * c + 4] = affine[:, 4 * c : 4 * c + 4]
+
+    # -------- what the photographs ask for: Newton steps of ln s, by channel of an object and for each patch --------
     gradient, curvature = np.zeros((n, 3)), np.zeros((n, 3))
     clusters = len(px.starts) - 1
     step, weight = np.zeros(clusters), np.zeros(clusters)
     owner = np.repeat(np.arange(n), np.diff(px.first))
     for part, g, h in evaluate_clusters(px, affine, tone, opt):
         own = rows[owner[part]]
+        # Gradient (k, 3) and system (k, 3, 3) of each patch along the logarithms of the three channels.
         slope = np.einsum("kcj,kj->kc", own, g[:, :NUMBERS])
         bend = np.einsum("kci,kij,kdj->kcd", own, h[:, :NUMBERS, :NUMBERS], own)
         np.add.at(gradient, owner[part], slope)
         np.add.at(curvature, owner[part], np.diagonal(bend, axis1=1, axis2=2))
+        # All three channels by one factor: delta_k = -u_k / H_k of Eq. M.32.
         weight[part] = np.maximum(bend.sum((1, 2)), 0.0)
         step[part] = -slope.sum(1) / np.maximum(weight[part], 1e-100)
+
+    # -------- both estimates compared --------
     away = np.clip(-gradient / np.maximum(curvature, 1e-100), -_LARGEST_STEP, _LARGEST_STEP)
+    # Relative to the light as it was computed: the exposure of `px` holds `light_gain` already.
     shown = light_gain[:, None] * level * np.exp(away)
     is_told = px.unsaturated() >= opt.min_pixels
     pixels = np.where(is_told, px.usable, 0.0)
@@ -189,6 +203,7 @@ def _smooth_error_of_light(step: np.ndarray, weight: np.ndarray, owner: np.ndarr
     total = np.maximum(np.bincount(owner, weight, n), 1e-100)
     away = step - (np.bincount(owner, weight * step, n) / total)[owner]
     variance = np.bincount(owner, weight * away**2, n) / total * patches / np.maximum(patches - 1, 1)
+    # Neighbours in the array are neighbours on the surface (`clusters.patches`); the last factor drops pairs across two objects.
     both = np.sqrt(weight[1:] * weight[:-1]) * (owner[1:] == owner[:-1])
     pairs = np.maximum(np.bincount(owner[1:], both, n), 1e-100)
     # The subtracted mean lowers the covariance by about the variance of the mean.
@@ -196,6 +211,7 @@ def _smooth_error_of_light(step: np.ndarray, weight: np.ndarray, owner: np.ndarr
     known = patches > 2
     share = np.where(known, pixels, 0.0)
     room = max(float(share @ shared / share.sum()) if share.sum() else UNKNOWN_SCATTER**2, 0.0)
+    # Objects of few patches are drawn towards the room. Where light is even, noise may leave `shared` below 0.
     freedom = np.where(known, patches - 2.0, 0.0)
     return np.sqrt(np.maximum(_PSEUDO_PATCHES * room + freedom * shared, 0.0) / (_PSEUDO_PATCHES + freedom))
 
@@ -230,13 +246,19 @@ def compare_levels(
     """
     pixels = pixels if pixels.any() else np.ones(len(pixels))
     base, shown, smooth = np.maximum(base, _DARKEST_LEVEL), np.maximum(shown, _DARKEST_LEVEL), np.maximum(smooth, _SMALLEST_ERROR)
+
+    # -------- the usual error of the base (Eq. M.33) --------
     size = relative_error_of_base(base.mean(1))
     if stated is None:
+        # Median over the pixels, so that many small objects do not decide.
         order = np.argsort(scatter / size)
         middle = (scatter / size)[order][np.searchsorted(np.cumsum(pixels[order]), 0.5 * pixels.sum())]
         usual = _BASE_FACTOR * np.maximum(middle, _SMALLEST_ERROR) * size
     else:
         usual = stated * size
+
+    # -------- factors kappa_B and kappa_L on both errors, from the scatter of the discrepancies (Eq. M.35) --------
+    # `share` is w_o, `count` the effective number N of objects.
     some = np.argsort(-pixels, kind="stable")[:_MOST_OBJECTS]
     share = pixels[some] / max(pixels[some].sum(), 1e-100)
     count = 1.0 / max(float((share**2).sum()), 1e-100)
@@ -246,12 +268,15 @@ def compare_levels(
         for of_light in _LIGHT_FACTORS if is_learnt else (_LIGHT_FACTOR,):
             own, light = of_base * usual[some], of_light * smooth[some]
             gain, away = _mean_gain(base[some], shown[some], share, np.hypot(own, light))
+            # `usual` contains the factor 1.4 already, so `of_base` is relative to it.
             log_prior = -0.5 * (np.log(of_base) / _BASE_FACTOR_WIDTH) ** 2
             log_prior -= 0.5 * (np.log(of_light / _LIGHT_FACTOR) / _LIGHT_FACTOR_WIDTH) ** 2
             found = count * (share @ _divide(away, own, light)[0]) + log_prior
             if found > best[0]:
                 best = (found, float(of_base), float(of_light), gain)
     _, of_base, of_light, gain = best
+
+    # -------- what of each discrepancy belongs to the light (Eq. M.34, M.36) --------
     discrepancy = np.log(shown.sum(1) / (base @ gain))
     base_error, light_error = of_base * usual, of_light * smooth
     claimed = light_error if stated is None else _LIGHT_FACTOR_MEASURED * smooth
@@ -268,11 +293,13 @@ def compare_levels(
 
 def _mean_gain(base: np.ndarray, shown: np.ndarray, share: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean gain (3,) and the logarithm of each object's brightness over it; robust against few large ones."""
+    # Colour by the geometric mean of each channel; then one factor for all channels, so that the mean of `away` is 0.
     ratio = np.log(shown / base)
     weight = share / error**2
     for _ in range(8):
         gain = np.exp(weight @ ratio / weight.sum())
         away = np.log(shown.sum(1) / (base @ gain))
+        # Student's weights, updated together with the gain: iteratively reweighted least squares.
         weight = share / error**2 * (_DEGREES_OF_FREEDOM + 1) / (_DEGREES_OF_FREEDOM + (away / error) ** 2)
         middle = weight @ away / weight.sum()
         gain, away = gain * np.exp(middle), away - middle
@@ -284,6 +311,8 @@ def _divide(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Divide d = error of the light - error of the base, both Student's t: log likelihood, mean of the light's part, and half
     the width of its central 68 % interval, each (O,), by quadrature."""
+    # (O, 242) values of the light's error. The product of both densities has a peak near 0 and another near d where the estimates
+    # disagree strongly, so nodes are dense around both.
     around_base = discrepancy[:, None] - base_error[:, None] * _NODES
     light = np.sort(np.concatenate([light_error[:, None] * _NODES, around_base], 1), 1)
     density = np.exp(_log_t(light, light_error[:, None]) + _log_t(discrepancy[:, None] - light, base_error[:, None]))
@@ -328,6 +357,7 @@ def gain_of_the_rest(levels: ObjectLevels, affine: np.ndarray) -> tuple[np.ndarr
     error = np.hypot(levels.base_error, levels.light_error)
     gain, _ = _mean_gain(levels.base, fitted, share, error)
     weight = share / error**2
+    # Standard error of the weighted mean, errors of the objects taken as independent.
     of_mean = np.sqrt(weight**2 @ error**2) / max(weight.sum(), 1e-100)
     return gain, _T_INTERVAL * float(np.hypot(np.sqrt(share @ levels.base_error**2), of_mean))
 
@@ -338,6 +368,8 @@ def light_scatter(levels: ObjectLevels, system: np.ndarray, affine: np.ndarray) 
     Args:
         levels: both estimates; system: (O, 16, 16) Gauss-Newton system of the data at the solution; affine: (O, 16).
     """
+    # Light that is too bright by exp(d) asks for all albedo numbers times exp(-d); to first order it moves the gradient by H
+    # theta_A d.
     brighter = np.where(np.arange(NUMBERS) < 12, affine, 0.0)
     moved = np.einsum("oij,oj->oi", system, brighter)
     return levels.deviation[:, None, None] ** 2 * moved[:, :, None] * moved[:, None, :]
@@ -349,6 +381,7 @@ def level_deviation(affine: np.ndarray, covariance: np.ndarray, mean_base: np.nd
     Args:
         affine: (O, 16) numbers; covariance: (O, 16, 16) of them; mean_base: (O, 3) mean base albedo.
     """
+    # The brightness is row . theta, linear in the numbers; to first order its logarithm has its relative deviation.
     row = np.zeros((len(affine), NUMBERS))
     for c in range(3):
         row[:, 4 * c : 4 * c + 3], row[:, 4 * c + 3] = mean_base, 1.0

@@ -68,12 +68,14 @@ class Pixels:
     def take(self, index: np.ndarray | slice) -> Pixels:
         """Return a subset; `index` increases. Every cluster stays, possibly empty."""
         begin, end = (index.start, index.stop) if isinstance(index, slice) else (0, 0)
+        # The new first pixel of a cluster is the number of chosen pixels before its old one.
         starts = np.clip(self.starts, begin, end) - begin if end else np.searchsorted(index, self.starts)
         return replace(self, starts=starts, **{name: getattr(self, name)[index] for name in _OF_EACH_PIXEL})
 
     def only(self, objects: np.ndarray) -> Pixels:
         """Return the pixels of some objects (increasing), which are numbered anew."""
         counts = np.diff(self.first)[objects]
+        # Only clusters of these objects remain, and their pixels follow one another again: sizes give the new starts.
         clusters = np.concatenate([np.arange(self.first[o], self.first[o + 1]) for o in objects] or [np.zeros(0, np.int64)])
         sizes = np.diff(self.starts)[clusters]
         number = np.full(self.n_objects, -1)
@@ -129,6 +131,7 @@ def darkest_and_tone(problem: FitProblem, response: Response, chunk: int) -> tup
     measured in.
     """
     parts = [problem.take(slice(first, first + chunk)) for first in range(0, len(problem.object_id), chunk)]
+    # The parts are views. Looking at one after another keeps the temporary arrays small.
     use = np.concatenate([_finite(part) for part in parts] or [np.zeros(0, bool)])
     brightness = np.concatenate([_brightness(part) for part in parts] or [np.zeros(0)])
     darkest = 1e-3 * float(np.median(brightness[use])) if use.any() else 0.0
@@ -171,12 +174,16 @@ def prepare_pixels(
     Returns:
         The pixels, and the curve that residuals are measured in.
     """
+    # -------- which pixels --------
     ids, use = np.asarray(problem.object_id), _finite(problem)
     brightness = _brightness(problem)
     if use.any():
         use &= brightness > (1e-3 * np.median(brightness[use]) if of_all is None else of_all[0])
+    # Objects are counted before the limit `most`: the count is what decides whether an object is fitted.
     usable = np.bincount(ids[use], minlength=problem.n_objects)
     use &= (usable >= fewest)[np.where(use, ids, 0)] if len(usable) else False
+
+    # -------- their order: by object, then by cluster --------
     index = np.flatnonzero(use)
     cluster = problem.cluster[index] if problem.cluster is not None else _equal_runs(ids[index])
     order = np.lexsort((cluster, ids[index]))
@@ -186,11 +193,15 @@ def prepare_pixels(
         some = choose_evenly(ids[index].astype(np.int64), first, most)
         index, cluster = index[some], cluster[some]
     obj = ids[index].astype(np.int64)
+    # A cluster begins where object or cluster changes. `starts` has its pixels, `first` the clusters of each object.
     fresh = np.flatnonzero(np.r_[True, (np.diff(obj) != 0) | (np.diff(cluster) != 0)]) if len(index) else np.zeros(0, np.int64)
     starts = np.r_[fresh, len(index)].astype(np.int64)
     first = np.searchsorted(obj[fresh], np.arange(problem.n_objects + 1)).astype(np.int64)
+
+    # -------- the arrays of the compiled loops --------
     tone = make_tone(response, problem.value[index]) if of_all is None else of_all[1]
     kind = np.result_type(*(np.asarray(a).dtype for a in (problem.value, problem.diffuse[0], problem.s0[0], problem.s1[0])))
+    # float32 if all of the cache is: half the memory of by far the largest arrays.
     kind = np.float32 if kind == np.float32 else np.float64
     levels = np.ascontiguousarray(problem.levels, np.float64)
     diffuse = np.empty((len(index), len(problem.diffuse), 3), kind)
@@ -198,6 +209,7 @@ def prepare_pixels(
     for half, (d, *pair) in enumerate(zip(problem.diffuse, problem.s0, problem.s1, strict=True)):
         diffuse[:, half] = d[index]
         for at, lobe in enumerate(pair):
+            # Values and slopes lie together, because the interpolation reads both at two neighbouring levels.
             lobes[:, :, 0, half, at] = own = np.ascontiguousarray(lobe[index], kind)
             kernels.slopes(own, levels, lobes[:, :, 1, half, at])
     lobes = lobes.reshape(*lobes.shape[:3], 6 * len(problem.diffuse))
@@ -222,6 +234,7 @@ def prepare_pixels(
 def choose_evenly(obj: np.ndarray, offsets: np.ndarray, most: int) -> np.ndarray:
     """Return the places of at most `most` pixels of each object, in equal strides: obj (n,) sorted, offsets (O + 1,) first pixel
     of each object."""
+    # The pixels of an object are sorted by cluster, so equal strides spread them evenly over its clusters.
     place, stride = np.arange(len(obj)) - offsets[obj], np.maximum(1, -(-np.diff(offsets) // most))
     return np.flatnonzero(place % stride[obj] == 0)
 
@@ -238,6 +251,8 @@ def fair_shares(counts: np.ndarray, budget: int) -> np.ndarray:
     counts = np.asarray(counts, np.float64)
     if counts.sum() <= budget:
         return np.ones(len(counts))
+    # With the objects sorted by size, candidate k keeps the k smallest whole and shares the rest of the budget equally. The first
+    # candidate that is not larger than the next object is the common number.
     order = np.sort(counts)
     below = np.r_[0.0, np.cumsum(order)[:-1]]
     limits = (budget - below) / np.arange(len(order), 0, -1)
@@ -294,9 +309,11 @@ def evaluate_clusters(
     """
     low = 0
     while low < px.n_objects:
+        # As many objects as have at most that many clusters together, and at least one.
         high = max(low + 1, int(np.searchsorted(px.first, px.first[low] + _CLUSTERS_AT_ONCE, side="right")) - 1)
         some = px.only(np.arange(low, high))
         count = len(some.starts) - 1
+        # Every cluster poses as an object with one cluster, so that `evaluate` returns a system for it.
         each = np.repeat(np.arange(count), np.diff(some.starts))
         own = np.repeat(affine[low:high], np.diff(some.first), 0)
         terms = evaluate(replace(some, obj=each, first=np.arange(count + 1)), own, tone, opt, True)
@@ -326,6 +343,7 @@ def _run(
     objects: np.ndarray | None,
 ) -> tuple[Terms, np.ndarray]:
     n_objects, width, halves = px.n_objects, NUMBERS + tone.size, px.diffuse.shape[1]
+    # Arrays that are not wanted stay empty; the compiled loop does not touch them.
     system = n_objects if want in (1, 2) else 0
     terms = Terms(
         *(np.zeros(n_objects) for _ in range(3)),
@@ -362,6 +380,7 @@ def run_in_threads(work: Callable[[np.ndarray], None], px: Pixels, objects: np.n
     if threads < 2 or len(objects) < 2:
         work(objects)
         return
+    # Parts of about equal numbers of pixels. An object is never split, so its sums have one order whatever the number of threads.
     cuts = np.searchsorted(done, np.linspace(0, done[-1], threads + 1)[1:-1])
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, np.split(objects, cuts)))

@@ -64,6 +64,7 @@ def population_mean(population: Population, roughness: np.ndarray, metallic: np.
     out = np.zeros((len(roughness), NUMBERS))
     out[:, GAINS] = population.gain
     out[:, 12] = population.contrast
+    # h_r = level - g_r r: the roughness at the object's mean base roughness r is then the level, whatever the contrast g_r.
     out[:, 13] = population.level - population.contrast * roughness
     out[:, 14:] = metallic
     return out
@@ -89,6 +90,7 @@ def population_prior(
     diagonal[14:] = 1.0 / 0.3**2  # counts only where metallic is free
     inverse = np.zeros((len(noise), NUMBERS, NUMBERS))
     inverse[:] = np.diag(diagonal)
+    # Row (r, 1) takes (g_r, h_r) to the level. Its outer product has rank one; the precision of the contrast completes it.
     level = np.stack([roughness, np.ones_like(roughness)], 1)
     inverse[:, 12:14, 12:14] = precision[3] * level[:, :, None] * level[:, None, :]
     inverse[:, 12, 12] += precision[4]
@@ -104,6 +106,7 @@ def _weight_and_scatter(inverse: np.ndarray, noise: np.ndarray, discount: float)
     """Return weight noise S^-1 and scatter W S W of a prior with the inverse covariance S^-1 = `inverse`."""
     size = _variance_by_number(noise, discount)
     weight = inverse * size[:, :, None]  # `inverse` does not couple roughness and albedo
+    # `size` is constant within each block that S^-1 couples, so W S W = size^2 S^-1.
     return weight, weight * size[:, :, None]
 
 
@@ -142,18 +145,21 @@ def with_profiled_roughness(
     Returns:
         The prior, which moves with the response.
     """
+    # As in `population_prior`: row (r, 1) takes (g_r, h_r) to the level. `strength` is the precision of Eq. M.29.
     own = np.stack([roughness, np.ones_like(roughness)], 1)
     outer = own[:, :, None] * own[:, None, :]
     size = discount * noise
     strength = size / profiled.deviation**2
     weight, scatter = prior.weight.copy(), prior.scatter.copy() if prior.scatter is not None else np.zeros_like(prior.weight)
     weight[:, 12:14, 12:14] = strength[:, None, None] * outer
+    # Pixels of the profile move the centre and the gradient of the descent together; the second term is twice that covariance.
     both = strength**2 * profiled.error**2 + 2.0 * strength * profiled.gradient_covariance
     scatter[:, 12:14, 12:14] = both[:, None, None] * outer
     weight[:, 12, 12] += size / _FIRST_SPREADS[4] ** 2
     scatter[:, 12, 12] += size**2 / _FIRST_SPREADS[4] ** 2
     centre = prior.centre.copy()
     centre[:, 13] = profiled.level - contrast * roughness
+    # W d(centre)/d(response): the centre moves in h_r alone, so this is strength (r, 1) d(level)/d(response).
     drift = np.zeros((*centre.shape, profiled.d_level_d_response.shape[1]))
     drift[:, 12:14] = strength[:, None, None] * own[:, :, None] * profiled.d_level_d_response[:, None]
     return GaussianPrior(centre, weight, scatter, drift)
@@ -182,6 +188,8 @@ def update_population(
     use = free.any(1)
     if not use.any():
         return population
+
+    # -------- the quadratic model of each object's data, around its current numbers --------
     g = np.where(free, terms.g[:, :NUMBERS], 0.0)[use]
     keep = (free[:, :, None] & free[:, None, :])[use]
     h = np.where(keep, terms.h[use][:, :NUMBERS, :NUMBERS], 0.0)
@@ -190,13 +198,17 @@ def update_population(
     fixed = ~own_free
     size = np.sqrt(_variance_by_number(own_noise, discount))
     i = np.arange(NUMBERS)
+
+    # -------- EM: numbers given the population (Eq. M.27), then the population given the numbers (Eq. M.28) --------
     for _ in range(_EM_ROUNDS):
         prior = population_prior(population, own_noise, r, m, discount)
         block = np.where(keep, h + prior.weight, 0.0)
+        # Rows of the identity keep the blocks of fixed numbers invertible; `keep` removes them again.
         block[:, i, i] += fixed
         inverse = np.where(keep, decompose(block).inverse(), 0.0)
         right = np.where(own_free, g + prior.gradient(here), 0.0)
         theta = here - np.einsum("oij,oj->oi", inverse, right)
+        # The objective counts in squares of residuals; the variance of a row turns its inverse curvature into a covariance.
         covariance = inverse * size[:, :, None] * size[:, None, :]
         population = _update_moments(population, theta, covariance, own_free, r)
     return population
@@ -207,6 +219,7 @@ def _update_moments(
 ) -> Population:
     """Return the population given numbers theta (O, 16) and covariances (O, 16, 16) of the objects (Eq. M.28)."""
     variance = np.diagonal(covariance, axis1=1, axis2=2)
+    # g_r and h_r trade against each other where the base roughness hardly varies, so the group is their level, with its variance.
     level = theta[:, 12] * roughness + theta[:, 13]
     jacobian = np.stack([roughness, np.ones_like(roughness)], 1)
     level_variance = np.einsum("oi,oij,oj->o", jacobian, covariance[:, 12:14, 12:14], jacobian)
@@ -216,15 +229,18 @@ def _update_moments(
     def group(k: int, value: np.ndarray, own: np.ndarray, centre: np.ndarray | float, moves: bool) -> np.ndarray | float:
         """Set the spread of group k and return its centre, which moves if asked; value and variance `own`: (objects, columns)."""
         away = value - centre
+        # Student's weights: a value far from the centre counts little, so odd objects do not decide.
         weight = (_DEGREES_OF_FREEDOM + 1) / (_DEGREES_OF_FREEDOM + away**2 / spread[k] ** 2)
         if moves:
             closeness = weight / (spread[k] ** 2 + own)
             centre = (closeness * value).sum(0) / closeness.sum(0)
             away = value - centre
+        # The first spread counts as `_PSEUDO_OBJECTS` values, so that a scene of one object has a spread.
         squares = (weight * away**2 + own).sum() + _PSEUDO_OBJECTS * _FIRST_SPREADS[k] ** 2
         spread[k] = np.clip(np.sqrt(squares / (value.size + _PSEUDO_OBJECTS)), _LEAST_SPREADS[k], _LARGEST_SPREADS[k])
         return centre
 
+    # A group learns from the objects in which all its numbers are free.
     seen = free[:, GAINS].all(1)
     if seen.any():
         gain = np.asarray(group(0, theta[seen][:, GAINS], variance[seen][:, GAINS], gain, True))

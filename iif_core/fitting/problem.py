@@ -72,6 +72,7 @@ class FitProblem:
         """Return some of the pixels."""
         changed: dict[str, Any] = {}
         for name, value in self.__dict__.items():
+            # These belong to objects or to the whole problem, not to pixels.
             if name in ("n_objects", "levels", "scatter", "given") or value is None:
                 continue
             changed[name] = tuple(part[index] for part in value) if isinstance(value, tuple) else value[index]
@@ -113,7 +114,7 @@ class FitOptions:
         lobes: whether the photographs can tell roughness and metal: without specular lobes, roughness is that of the base, or
             `MATTE_ROUGHNESS` where that is smoother, and nothing is metal.
         metallic_prior: see `select`.
-        base_tells_levels: the base knows the brightness of objects by itself, beside the photographs.
+        base_tells_levels: the base is a second witness of the brightness of objects, next to the photographs.
         prediction_errors: how the predictions err that the base was made of; None: not known, and learnt from the scene.
         texture_sigma: standard deviation of the albedo above which a direction of the texture counts.
         brightest: largest albedo in the fit. It exceeds 1 because in light that is a little too dim a white wall would otherwise
@@ -151,7 +152,7 @@ class SgdOptions:
         method: `sgd` or `adam`; rate: step size, None: 10, or 0.01 for adam.
         epochs: passes over the pixels; batch: pixels of a step; decay: factor on the rate after each epoch.
         seed: of the order of the pixels; free_response: fit the response too.
-        steps: steps over all epochs, for which the pixels are gone through as often as needed; None: one pass an epoch.
+        steps: steps over all epochs, with as many passes over the pixels as they need; None: one pass an epoch.
     """
 
     method: str = "sgd"
@@ -218,12 +219,15 @@ def albedo_uncertainty(
     """
     known = object_id >= 0
     o = np.where(known, object_id, 0)
+    # (b, 1) of each pixel: channel c of the albedo is one . theta_c, theta_c the channel's row of [A | b].
     one = np.concatenate([np.asarray(base, np.float64)[:, :3], np.ones((len(base), 1))], 1)
     variance = np.asarray(base_deviation, np.float64) ** 2
     if len(affine):
         spread = variance.copy()
         for c in range(3):
             rows = slice(4 * c, 4 * c + 4)
+            # First order in both errors, taken as independent: (b, 1)' Cov(theta_c) (b, 1) from the numbers, and A_c carries the
+            # variances of the base. Its channels count as uncorrelated.
             fit = np.einsum("ni,nij,nj->n", one, covariance[:, rows, rows][o], one)
             through = (affine[:, 4 * c : 4 * c + 3][o] ** 2 * spread).sum(1)
             variance[:, c] = np.where(known, np.maximum(fit, 0) + through, spread[:, c])

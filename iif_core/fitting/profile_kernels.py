@@ -67,9 +67,11 @@ def fit_albedo(
     starts, first = pixels.starts, pixels.first
     free, centre, weight, metallic, roughness = task.free, task.centre, task.weight, task.metallic, task.roughness
     halves = diffuse.shape[1]
+    # The work arrays are made once, for the largest of the objects.
     most = 0
     for x in range(len(objects)):
         most = max(most, starts[first[objects[x] + 1]] - starts[first[objects[x]]])
+    # U and V of Eq. M.20 by channel, half and pixel: the exposed radiance is a U + V.
     u = np.zeros((3, halves, most))
     v = np.zeros((3, halves, most))
     g = np.zeros(4)
@@ -79,12 +81,16 @@ def fit_albedo(
     lower = np.zeros((4, 4))
     theta = np.zeros(4)
     tried = np.zeros(4)
+    # All pixels have the same roughness, hence the same place between the levels. A negative roughness leaves `lobe` at 0: U = e
+    # (1 - m) D, V = 0.
     j, weights, _ = _interpolation_weights(pixels.levels, max(roughness, 0.02))
     lobe = np.zeros(lobes.shape[3])
     for x in range(len(objects)):
         o = objects[x]
         low = starts[first[o]]
         n = starts[first[o + 1]] - low
+
+        # -------- U and V of the pixels of one object --------
         cost[o] = 0.0
         for q in range(n):
             p = low + q
@@ -96,6 +102,8 @@ def fit_albedo(
                     s0 = lobe[6 * half + c]
                     u[c, half, q] = exposure[p] * ((1.0 - m) * diffuse[p, half, c] + m * s0)
                     v[c, half, q] = exposure[p] * (0.04 * (1.0 - m) * s0 + lobe[6 * half + 3 + c])
+
+        # -------- Levenberg-Marquardt on the row of [A | b] of each channel --------
         for c in range(3):
             own = free[o, 4 * c : 4 * c + 4]
             middle = centre[o, 4 * c : 4 * c + 4]
@@ -111,15 +119,19 @@ def fit_albedo(
             curve = (tone.knee, tone.gain, tone.curve[c], tone.ends[c, 0])
             for i in range(4):
                 theta[i] = affine[o, 4 * c + i]
+            # `total` decides whether a step is taken; `shown`, without the range term (Eq. M.11), is the evidence Q of Eq. M.21.
             total, shown, size = _system(theta, given, curve, penalties, middle, prior, g, h)
             damping = _FIRST_DAMPING
             for _ in range(task.steps):
+                # `tried` first receives the step, then the numbers to which it leads.
                 expected = _solve(h, g, own, damping, lower, tried)
+                # Newton decrement of the damped system: the fall that the quadratic model promises, up to the damping.
                 if 0.5 * expected <= task.tolerance * size:
                     break
                 for i in range(4):
                     tried[i] = theta[i] - tried[i]
                 new_total, new_shown, new_size = _system(tried, given, curve, penalties, middle, prior, new_g, new_h)
+                # NaN compares as false, so a step to it is refused.
                 if new_total < total:
                     total, shown, size = new_total, new_shown, new_size
                     theta[:] = tried
@@ -141,6 +153,7 @@ def _system(theta, given, curve, penalties, middle, prior, g, h):
     brightest, box = penalties.brightest, penalties.box
     c2 = penalties.robust_width * penalties.robust_width
     last_half = len(u) - 1
+    # Scalars instead of arrays: the loop over the pixels then only reads.
     t0, t1, t2, t3 = theta[0], theta[1], theta[2], theta[3]
     g0 = g1 = g2 = g3 = 0.0
     h00 = h01 = h02 = h03 = h11 = h12 = h13 = h22 = h23 = h33 = 0.0
@@ -156,12 +169,14 @@ def _system(theta, given, curve, penalties, middle, prior, g, h):
         e1, d1, _, _ = _apply_curve(a * u[0, q] + v[0, q], knee, gain, table, end)
         e1 -= target[q]
         d1 *= u[0, q]
+        # A single half stands for both.
         e2 = e1
         d2 = d1
         if last_half > 0:
             e2, d2, _, _ = _apply_curve(a * u[1, q] + v[1, q], knee, gain, table, end)
             e2 -= target[q]
             d2 *= u[1, q]
+        # A bound that is met has no residual and no slope (Eq. M.9).
         if saturated[q]:
             if e1 > 0.0:
                 e1 = 0.0
@@ -175,9 +190,11 @@ def _system(theta, given, curve, penalties, middle, prior, g, h):
         size += rho
         data += rho if product >= 0.0 else -rho
         w = trust[q] / (1.0 + modulus / c2)
+        # First and second derivative by the albedo a of the pixel (Eq. M.8); a = (b, 1) . theta carries them to the four numbers.
         slope = 0.5 * w * (d1 * e2 + d2 * e1)
         bend = w * d1 * d2
         beyond = raw - a
+        # A clamped albedo no longer moves the prediction, so the range term (Eq. M.11) replaces both derivatives.
         if beyond != 0.0:
             outside += 0.5 * box * beyond * beyond
             slope = box * beyond
@@ -214,6 +231,7 @@ def _solve(h, g, own, damping, lower, step):
 
     Only the lower triangle of H is read. H has no negative directions, because light and slopes of both halves are positive.
     """
+    # Fixed numbers get rows of the identity, and step 0. The small terms keep a pivot positive where no pixel moves a number.
     for i in range(4):
         for j in range(i + 1):
             total = h[i, j] if own[i] and own[j] else (1.0 if i == j else 0.0)
@@ -222,9 +240,11 @@ def _solve(h, g, own, damping, lower, step):
             for k in range(j):
                 total -= lower[i, k] * lower[j, k]
             if i == j:
+                # Rounding can take a pivot below 0 where two columns are almost the same.
                 lower[i, i] = np.sqrt(max(total, 1e-12 * abs(h[i, i]) + 1e-100))
             else:
                 lower[i, j] = total / lower[j, j]
+    # Forward and back substitution: L y = g, L' step = y.
     for i in range(4):
         total = g[i] if own[i] else 0.0
         for k in range(i):

@@ -85,6 +85,7 @@ def measure_texture(px: Pixels, opt: FitOptions) -> Texture:
     counts = np.maximum(px.counts, 1)[:, None]
     mean = np.stack([px.sum_by_object(base[:, c]) for c in range(5)], 1) / counts
     away = base - mean[px.obj]
+    # Covariance of the base colours of each object; its eigenvalues are the variances along the directions of colour (Eq. M.19).
     covariance = np.zeros((px.n_objects, 3, 3))
     for i in range(3):
         for j in range(i, 3):
@@ -101,12 +102,15 @@ def row_variance(terms: Terms, px: Pixels, free: np.ndarray) -> np.ndarray:
     With independent errors this is their variance; errors that the pixels of a cluster share make it larger. Objects with fewer
     than four clusters get the median over the others.
     """
+    # With independent rows of variance s the score u_k of a cluster has the covariance s H_k, so the sum of u_k' H^-1 u_k is s
+    # times the number of free numbers. Errors that the pixels of a cluster share add up in u_k and enlarge it.
     centred, counts = _centred_scores(terms, px)
     out = np.full(px.n_objects, np.nan)
     for o in np.flatnonzero((counts >= 4) & free.any(1)):
         k = free[o]
         own = centred[px.first[o] : px.first[o + 1]][:, :NUMBERS][:, k]
         block = terms.h[o][:NUMBERS, :NUMBERS][np.ix_(k, k)]
+        # The damping bounds what directions contribute that the pixels hardly determine.
         inverse = decompose(block[None]).inverse(1e-6)[0]
         out[o] = np.einsum("ci,ij,cj->", own, inverse, own) / k.sum() * counts[o] / (counts[o] - 1)
     known = np.isfinite(out) & (out > 0)
@@ -119,6 +123,7 @@ def _centred_scores(terms: Terms, px: Pixels) -> tuple[np.ndarray, np.ndarray]:
     filled = np.diff(px.starts) > 0
     owner = np.repeat(np.arange(px.n_objects), np.diff(px.first))
     counts = np.bincount(owner[filled], minlength=px.n_objects)
+    # `terms.g` is the sum of the scores of an object.
     mean = terms.g / np.maximum(counts, 1)[:, None]
     return np.where(filled[:, None], terms.scores - mean[owner], 0.0), counts
 
@@ -161,11 +166,14 @@ def profile_roughness(
     affine = np.zeros((n_objects, 3, len(ROUGHNESS_GRID), NUMBERS))
     everything = np.arange(n_objects)
     for kind in range(3 if opt.metals else 1):
+        # Metallic as predicted makes sense only where the predictions show both kinds on one object.
         tried = np.flatnonzero(mixed) if kind == 2 else everything
         current = state.affine[:, :12].copy()
         for at in range(len(ROUGHNESS_GRID) - 1, -1, -1):
             first = at == len(ROUGHNESS_GRID) - 1
             steps = 2 * _STEPS_PER_POINT if first else _STEPS_PER_POINT
+            # `current` (O, 12) is overwritten with the fit, so the next, smoother value starts from it. The first one starts from
+            # a descent at another roughness and gets twice the steps.
             found = _fit_albedo_at(px, current, prior, tone, opt, free, KINDS[kind], ROUGHNESS_GRID[at], steps, tried)
             if kind == 0 and first:  # without a specular lobe, which a very wide one resembles
                 bare = _fit_albedo_at(px, current.copy(), prior, tone, opt, free, KINDS[0], -1.0, steps, tried)
@@ -173,6 +181,7 @@ def profile_roughness(
             cost[tried, kind, at] = found[tried]
             affine[:, kind, at, :12] = current
             affine[:, kind, at, 13:] = [ROUGHNESS_GRID[at], *KINDS[kind]]
+    # The variance of a row is measured at the best pair, over the albedo numbers alone: those are what the profile fits.
     best = cost.reshape(n_objects, -1).argmin(1)
     where = affine.reshape(n_objects, -1, NUMBERS)[everything, best]
     albedo = free & (np.arange(NUMBERS) < 12)
@@ -238,8 +247,8 @@ def choose_kinds(
 
     Which of two objects has the rougher base counts as an observation of their roughness. Where the prior of the predictions
     states its errors, the metallic of the base is an observation, and its roughness takes the place of the histogram's. A metal
-    must be as bright as its base suggests, or at least no less so
-    than as a dielectric (docs/method/fitting.md#selection-of-kind-and-roughness).
+    must agree with the brightness of its base at least as well as a dielectric does
+    (docs/method/fitting.md#selection-of-kind-and-roughness).
 
     Args:
         found: the evidence; counts: (O,) bool, objects that enter the histogram.
@@ -247,22 +256,31 @@ def choose_kinds(
         given: (O, 2) roughness and metallic that are known, NaN = chosen here; None: all are chosen.
         stated: errors of the predictions; None: not known.
     """
+    # -------- evidence (Eq. M.21), and the pairs that are allowed --------
+    # `everything` is the evidence of all pairs, `cost` is infinite where a pair is excluded. Exponents stay above -700
+    # (docs/method/numerics.md#exponentials-of-evidence).
     cost = found.cost.copy()
     scale = EVIDENCE_DISCOUNT * found.noise[:, None, None]
     everything = np.exp(np.maximum((cost.min((1, 2), keepdims=True) - cost) / scale, -700.0)) * _PRIOR_OF_KINDS
+    # An object whose best metal is too rough loses all its metals, not only the rough ones.
     cost[ROUGHNESS_GRID[cost[:, 1].argmin(1)] > ROUGHEST_METAL, 1] = np.inf
     cost[:, 1, ROUGHNESS_GRID > ROUGHEST_METAL] = np.inf
     if given is not None:
         cost = _within_given(cost, found.cost, given)
     allowed_share = np.where(np.isfinite(cost), everything, 0.0).sum((1, 2)) / everything.sum((1, 2))
+
+    # -------- what enters the EM: photographs, base, and the first histogram --------
     log_likelihood = (cost.min((1, 2), keepdims=True) - cost) / scale
     likelihood = np.where(counts[:, None, None], np.exp(np.maximum(log_likelihood, -700.0)), 1.0)
     flat = _PRIOR_OF_KINDS / len(ROUGHNESS_GRID) * np.ones(len(ROUGHNESS_GRID))
     prior, brightness = flat, _log_brightness(found, mean_base[:, :3])
+    # (O, R) likelihood of the base's roughness at each roughness of the grid; 1 = the base says nothing.
     of_base = np.ones((len(counts), len(ROUGHNESS_GRID)))
     if stated is not None:
         likelihood[:, 1] *= np.exp(stated.metal_log_odds(mean_base[:, 4]))[:, None]
         of_base = stated.roughness_prior(mean_base[:, 3], ROUGHNESS_GRID)
+
+    # -------- EM: posteriors of the objects, then the histogram they share (Eq. M.23) --------
     for _ in range(50):
         posterior = likelihood * prior * of_base[:, None]
         if counts.sum() >= FEWEST_OBJECTS:
@@ -274,8 +292,11 @@ def choose_kinds(
         prior = histogram if stated is None else np.broadcast_to(histogram.mean(1, keepdims=True), histogram.shape)
         if stated is None and counts.sum() >= FEWEST_OBJECTS:
             of_base[counts] = _likelihood_of_base(posterior[counts].sum(1), mean_base[counts, 3], pixels[counts])
+
+    # -------- kind of each object, and its roughness given that kind (Eq. M.24) --------
     probability = posterior.sum(2)
     kind = probability.argmax(1)
+    # From here on `given` is no longer the argument: it is the posterior of the roughness given the kind, (O, R).
     given = posterior[np.arange(len(kind)), kind]
     given = given / np.maximum(given.sum(1, keepdims=True), 1e-300)
     mean = given @ ROUGHNESS_GRID
@@ -290,13 +311,16 @@ def _within_given(cost: np.ndarray, tried: np.ndarray, given: np.ndarray) -> np.
     """Leave only what agrees with the known values (O, 2) of each object: the nearest roughness of the grid, and the kind whose
     metallic is nearest. What is known holds against `ROUGHEST_METAL` too, and where nothing that agrees was tried."""
     roughness, metallic = given.T
+    # (O, R) and (O, 3): which roughnesses and kinds agree with what is known; everything agrees where nothing is.
     nearest = np.abs(ROUGHNESS_GRID - np.where(np.isnan(roughness), 0.0, roughness)[:, None]).argmin(1)
     at = np.isnan(roughness)[:, None] | (np.arange(len(ROUGHNESS_GRID)) == nearest[:, None])
     metal = np.where(np.isnan(metallic), 0.0, metallic) >= 0.5
     kind = np.isnan(metallic)[:, None] | (np.arange(len(KINDS)) == metal[:, None])
     agrees = kind[:, :, None] & at[:, None, :]
     known = ~np.isnan(given).all(1)
+    # A known kind lifts the bound on rough metals, so its costs are those before the exclusion (`tried`).
     left = np.where(agrees, np.where(np.isnan(metallic)[:, None, None], cost, tried), np.inf)
+    # Where nothing is left, costs before the exclusion count, and after that all pairs that agree count alike.
     barren = ~np.isfinite(left).any((1, 2), keepdims=True)
     left = np.where(barren & agrees & np.isfinite(tried), tried, left)
     left = np.where(~np.isfinite(left).any((1, 2), keepdims=True) & agrees, 0.0, left)
@@ -318,11 +342,15 @@ def _likelihood_of_base(posterior: np.ndarray, roughness: np.ndarray, pixels: np
     Returns:
         (O, R), at most 1; all 1 where a rougher base does not go with a rougher object.
     """
+    # `share` and `count` are w_o and N of Eq. M.35; the slope is held at 0 or above, because a smoother base is no sign of a
+    # rougher object.
     share = pixels / pixels.sum()
     count = 1.0 / float((share**2).sum())
     expected = posterior @ ROUGHNESS_GRID
     middle, usual = share @ expected, share @ roughness
     spread = count * (share @ (posterior @ (ROUGHNESS_GRID - middle) ** 2)) + _UNRELATED_OBJECTS * _ROUGHNESS_SPREAD**2
+    # Regression of the base on the expected roughness. Its square in the denominator is an expectation over the posterior, so
+    # what is not known about the roughness flattens the line.
     slope = max(count * float(share @ ((roughness - usual) * (expected - middle))) / spread, 0.0)
     away = (roughness - usual)[:, None] - slope * (ROUGHNESS_GRID - middle)
     square = count * (share @ (posterior * away**2).sum(1)) + _UNRELATED_OBJECTS * (share @ (roughness - usual) ** 2)
@@ -332,7 +360,7 @@ def _likelihood_of_base(posterior: np.ndarray, roughness: np.ndarray, pixels: np
 
 
 def _log_brightness(found: Profile, mean_base: np.ndarray) -> np.ndarray:
-    """Logarithm of the brightness of the fitted albedo over that of the base, (O, 3, R); 0 where nothing was tried."""
+    """Logarithm of the fitted brightness over the brightness of the base, (O, 3, R); 0 where nothing was tried."""
     base = np.maximum(np.asarray(mean_base, np.float64), _DARKEST)
     numbers = found.affine[..., :12].reshape(*found.cost.shape, 3, 4)
     fitted = np.einsum("okrci,oi->okr", numbers[..., :3], base) + numbers[..., 3].sum(-1)
@@ -345,19 +373,21 @@ def _agreement_with_base(posterior: np.ndarray, brightness: np.ndarray, counts: 
 
     posterior: (O, 3, R) up to a factor; brightness: (O, 3, R) relative to the base; counts: (O,) objects that tell what is usual.
     """
+    # Posterior means of the log brightness: of each object over all kinds, and of each kind.
     total = np.maximum(posterior.sum((1, 2)), 1e-300)
     of_object = ((posterior * brightness).sum((1, 2)) / total)[counts]
     of_kind = (posterior * brightness).sum(2) / np.maximum(posterior.sum(2), 1e-300)
     usual = np.median(of_object)
     width = max(_NORMAL_MEDIAN * float(np.median(np.abs(of_object - usual))), LEAST_SPREAD)
     agreement = (1.0 + ((of_kind - usual) / width) ** 2 / DEGREES_OF_FREEDOM) ** (-0.5 * (DEGREES_OF_FREEDOM + 1.0))
+    # At most 1: agreement never speaks for a metal, or dielectrics whose base is wrong would become metals.
     return np.where(counts[:, None], np.minimum(agreement / agreement[:, :1], 1.0), 1.0)
 
 
 def describe_models(
     rank: np.ndarray, free: np.ndarray, affine: np.ndarray, pixels: np.ndarray, given: np.ndarray | None = None
 ) -> list[str]:
-    """Describe in words what was fitted for each object.
+    """Describe what was fitted for each object.
 
     Args:
         rank: (O,) directions of colour; free: (O, 16) bool; affine: (O, 16); pixels: (O,) usable pixels.
