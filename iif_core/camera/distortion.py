@@ -101,6 +101,7 @@ def distort(lens: Distortion, points: ArrayLike) -> tuple[Array, Array]:
     points = np.asarray(points, np.float64)
     x, y = points[..., 0], points[..., 1]
     r = np.hypot(x, y)
+    # On the axis r_d / r is 0 / 0; both models have scale 1 there.
     safe = np.where(r > 0, r, 1.0)
     scale = np.where(r > 0, _radial(lens, r) / safe, 1.0)
     p1, p2 = lens.p
@@ -124,6 +125,7 @@ def undistort(lens: Distortion, points: ArrayLike) -> tuple[Array, Array]:
     if any(lens.p):
         for _ in range(20):
             q = _newton_step(lens, q, points)
+    # Whatever the steps did, a point counts only if distorting it leads back.
     again, unique = distort(lens, q)
     found = np.isfinite(r) & unique & (np.abs(again - points).max(-1, initial=0) <= 1e-9 * (1 + r_d))
     return np.where(found[..., None], q, 0.0), found
@@ -134,6 +136,7 @@ def _invert_radial(lens: Distortion, r_d: Array) -> Array:
     # The angle is bounded where r is not.
     top = math.atan(lens.turning_radius)
     low, high = np.zeros_like(r_d), np.full_like(r_d, top)
+    # r_d at the turning point, beyond which no radius is reached.
     limit = float(_radial(lens, np.array(math.tan(min(top, math.pi / 2 - 1e-9)))))
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -186,10 +189,12 @@ def pinhole_inside(lens: Distortion, source: Pinhole) -> Pinhole:
     def border(u: Array | float, v: Array | float) -> Array:
         at = np.stack(np.broadcast_arrays(u / source.fx, v / source.fy), -1).astype(np.float64)
         point, found = undistort(lens, at)
+        # A border point without a solution is put at the turning radius, in the same direction.
         beyond = at / np.maximum(np.linalg.norm(at, axis=-1, keepdims=True), 1e-12) * reach
         return np.where(found[:, None], point, beyond)
 
     widest = math.tan(MAX_ANGLE)
+    # Each side of the rectangle touches the innermost point of the undistorted border on that side.
     x0 = max(border(left, along_y)[:, 0].max(), -widest)
     x1 = min(border(right, along_y)[:, 0].min(), widest)
     y0 = max(border(along_x, top)[:, 1].max(), -widest)
@@ -200,6 +205,7 @@ def pinhole_inside(lens: Distortion, source: Pinhole) -> Pinhole:
             f"lens {lens.kind} with k={lens.k}, p={lens.p}: no upright picture fits inside the undistorted"
             " photograph; the coefficients do not belong to this camera"
         )
+    # Less than a pixel is left over on either axis; half of it falls on each side.
     spare_x, spare_y = (x1 - x0) * source.fx - width, (y1 - y0) * source.fy - height
     cx, cy = float(-x0 * source.fx - spare_x / 2), float(-y0 * source.fy - spare_y / 2)
     return Pinhole(source.fx, source.fy, cx, cy, width, height)
@@ -253,6 +259,7 @@ def _sample(image: Array, known: Array, u: Array, v: Array, nearest: bool) -> tu
     if nearest:
         i, j = np.clip(np.floor(u).astype(int), 0, width - 1), np.clip(np.floor(v).astype(int), 0, height - 1)
         return image[j, i], inside & known[j, i]
+    # Pixel centres lie at + 0.5. Half a pixel beyond the outer centres the border pixel is repeated.
     a, b = np.clip(u - 0.5, 0, width - 1), np.clip(v - 0.5, 0, height - 1)
     i, j = np.minimum(a.astype(int), max(width - 2, 0)), np.minimum(b.astype(int), max(height - 2, 0))
     a, b = a - i, b - j
@@ -261,6 +268,7 @@ def _sample(image: Array, known: Array, u: Array, v: Array, nearest: bool) -> tu
     corners = (((1 - a) * (1 - b), j, i), (a * (1 - b), j, i1), ((1 - a) * b, j1, i), (a * b, j1, i1))
     for weight, row, column in corners:
         shaped = weight.astype(np.float32).reshape(weight.shape + (1,) * (image.ndim - 2))
+        # A pixel of weight 0 may be NaN and must not enter.
         value = value + np.where(shaped > 0, image[row, column] * shaped, 0)
         complete = complete & (known[row, column] | (weight <= 1e-6))
     return value, complete

@@ -114,6 +114,7 @@ class GainRows:
         """Select about `limit` rows: whole patches, by a hash of their number."""
         if len(self.view) <= limit:
             return self
+        # A multiplicative hash, of which the upper 24 bits are spread evenly. A patch keeps all of its rows or none.
         mixed = self.patch.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(40)
         return self.take(mixed.astype(np.float64) < limit / len(self.view) * 2.0**24)
 
@@ -138,22 +139,32 @@ def estimate(rows: GainRows, n_views: int, white_balance: bool = True, vignettin
     data = _Entries.of(rows, n_views)
     if not len(data.value):
         return CameraGains(np.ones((n_views, 3)), np.zeros(2), np.zeros(n_views, bool))
+
+    # -------- unknowns: gains of the views, then a and b --------
     design = data.design(n_views, white_balance, vignetting)
     gauge, group = data.gauge(n_views, white_balance, vignetting)
     theta, weight, scale = np.zeros(design.shape[1]), np.ones(len(data.value)), 0.0
+    # Views without rows have empty columns and stay at gain 1.
     known = np.flatnonzero(np.asarray(np.abs(design).sum(0)).ravel() > 0)
     for _ in range(rounds):
+        # -------- levels of the patches eliminated: X'Q'WQX and X'Q'WQ ln y (Eq. C.26) --------
+        # `mixed` sums weighted rows of X over each patch; the product below is what the mean of each patch takes away.
         total = np.bincount(data.cell, weight)
         mixed = data.members(weight) @ design
         weighted = design.multiply(weight[:, None]).tocsr()
         normal = np.asarray((design.T @ weighted - mixed.T @ mixed.multiply(1.0 / total[:, None])).todense())
         level = np.bincount(data.cell, weight * data.value) / total
         right = np.asarray(design.T @ (weight * (data.value - level[data.cell]))).ravel()
+
+        # -------- gauge and prior --------
+        # The data leave the mean of each group of views open. A projector on these means sets them to 0 and changes no ratio.
         normal += gauge * max(float(np.trace(normal)) / len(theta), 1e-12)
         if vignetting:
             normal[[-2, -1], [-2, -1]] += max(scale, 1e-3) ** 2 / _VIGNETTING_SIGMA**2  # rows count 1, not 1 / scale^2
         step = np.zeros(len(theta))
         step[known] = np.linalg.solve(normal[np.ix_(known, known)], right[known])
+
+        # -------- Cauchy weights from the residuals about the levels --------
         left = data.value - design @ step
         residual = left - (np.bincount(data.cell, weight * left) / total)[data.cell]
         scale = float(1.4826 * np.median(np.abs(residual)))
@@ -196,6 +207,7 @@ def with_held_out_views(rows: GainRows, gains: CameraGains, moving: np.ndarray) 
     flat = log_y - np.log(falloff(gains.vignetting, rows.radius2))[:, None]
     size = int(rows.patch.max(initial=-1)) + 1
     out, estimated = gains.gain.copy(), gains.estimated.copy()
+    # Views that moved set the levels; held-out ones are compared with them.
     ahead = moving[rows.view] & gains.estimated[rows.view]
     gap = np.full(flat.shape, np.nan)
     for c in range(3):
@@ -209,6 +221,7 @@ def with_held_out_views(rows: GainRows, gains: CameraGains, moving: np.ndarray) 
         least = int(np.isfinite(own).sum(0).min())
         estimated[v] = least >= MIN_ROWS
         if estimated[v]:
+            # Without white balance in the model a view has one gain for all channels.
             out[v] = np.exp(np.nanmedian(own) if shared else np.nanmedian(own, 0))
     return CameraGains(out, gains.vignetting, estimated, gains.residual, gains.evidence)
 
@@ -226,6 +239,7 @@ class _Entries:
     @classmethod
     def of(cls, rows: GainRows, n_views: int) -> _Entries:
         row, channel = np.nonzero(np.isfinite(rows.y) & (rows.y > 0))
+        # A cell is one channel of one patch, which has a level to itself.
         key = rows.patch[row].astype(np.int64) * 3 + channel
         view = rows.view[row].astype(np.int64)
         keep = np.ones(len(row), bool)
@@ -269,6 +283,7 @@ class _Entries:
         for g in range(int(group.max(initial=-1)) + 1):
             for c in range(channels):
                 own = np.flatnonzero(group == g) * channels + c
+                # Projector on the constant vector over the views of one group.
                 out[np.ix_(own, own)] = 1.0 / len(own)
         return out, group
 
@@ -285,6 +300,7 @@ def _depth(gains: CameraGains) -> float:
 def _halves(rows: GainRows) -> np.ndarray:
     """(n,) bool: blocks dealt from the largest into two halves of equal size; patches where one block dominates."""
     blocks, number, count = np.unique(rows.block, return_inverse=True, return_counts=True)
+    # One large object would leave one half nearly empty; its patches are divided instead.
     if not len(blocks) or count.max() > 0.6 * count.sum():
         return rows.patch.astype(np.int64) % 2 == 0
     side, load = np.zeros(len(blocks), bool), [0, 0]
@@ -308,6 +324,7 @@ def _judge(
         if not len(residual[0][0]):
             continue
         spread = [float(1.4826 * np.median(np.abs(r))) for r, _ in residual]
+        # One width for both models, or the better one would be judged by a narrower loss.
         width = max(2.385 * spread[0], 1e-4)
         losses.append(np.log1p((residual[0][0] / width) ** 2) - np.log1p((residual[1][0] / width) ** 2))
         clusters.append(judged.block[residual[0][1]].astype(np.int64) * n_views + judged.view[residual[0][1]])
@@ -317,6 +334,7 @@ def _judge(
     loss, cluster = np.concatenate(losses), np.unique(np.concatenate(clusters), return_inverse=True)[1]
     total, count = np.bincount(cluster, loss), np.bincount(cluster)
     mean = float(loss.mean())
+    # Rows of one object in one view err together, so their sum counts as one observation (Eq. C.27).
     error = float(np.sqrt(((total - mean * count) ** 2).sum()) / len(loss))
     before, after = np.mean(spreads, 0)
     return mean, error, float(before), float(after)
@@ -335,5 +353,6 @@ def _held_residual(rows: GainRows, gains: CameraGains, n_views: int) -> tuple[np
         residual = value - level[cell]
         scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
         weight = 1.0 / (1.0 + (residual / (2.385 * scale)) ** 2)
+    # The only row of a cell equals its level and says nothing.
     several = np.bincount(cell)[cell] >= 2
     return residual[several], row[several]

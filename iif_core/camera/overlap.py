@@ -101,9 +101,12 @@ def patch_rows(
     value, normal = np.asarray(value, np.float64), np.asarray(normal)
     good = np.isfinite(value).all(1)
     if share < 1.0:
+        # A hash of the patch decides, so every view keeps the same patches.
         mixed = np.asarray(patch, np.uint64) * np.uint64(0x9E3779B97F4A7C15)
         good &= (mixed >> np.uint64(40)).astype(np.float64) < share * 2.0**24
     value, patch, block = value[good], np.asarray(patch)[good], np.asarray(block)[good]
+
+    # -------- pixels in order of patch and side --------
     facing = dominant_side(normal[good]).astype(np.int8)
     order = np.lexsort((facing, patch))
     radius2 = (np.zeros(len(good)) if radius2 is None else np.asarray(radius2, np.float64))[good][order]
@@ -112,14 +115,19 @@ def patch_rows(
     fresh[1:] = (patch[1:] != patch[:-1]) | (facing[1:] != facing[:-1])
     start = np.flatnonzero(fresh)
     count = np.diff(np.r_[start, len(patch)])
+    # Places of the middle half of each run, once its values are sorted.
     low, high = start + count // 4, start + count - count // 4
     member = np.cumsum(fresh) - 1
+
+    # -------- mean of the middle half, a channel at a time --------
     out, clipped = np.full((len(start), 3), np.nan), np.zeros((len(start), 3), bool)
     for c in range(3) if len(start) else ():
+        # Values sorted within each patch; differences of running sums are sums over runs.
         ordered = value[np.lexsort((value[:, c], member)), c]
         total = np.r_[0.0, np.cumsum(ordered)]
         middle = (total[high] - total[low]) / (high - low)
         quarter, three = ordered[low], ordered[high - 1]
+        # A saturated lower quartile means at least three quarters of the pixels, an unsaturated upper one fewer than a quarter.
         clipped[:, c] = quarter >= saturation
         even = three - quarter <= np.maximum(evenness * middle, 1.5 / 255.0)
         out[:, c] = np.where(clipped[:, c] | (even & (three < saturation)), middle, np.nan)

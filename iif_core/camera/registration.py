@@ -94,9 +94,9 @@ class Registration:
 
 
 def feature_image(image: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Compute log luminance less its surroundings (6 % of the width), in units of 0.35, clipped to +-3 (Eq. C.29).
+    """Compute the log of the mean channel less its surroundings (6 % of the width), in units of 0.35, clipped to +-3 (Eq. C.29).
 
-    Luminance is relative to its median over pixels that are not black, and `DARK` is added before the logarithm. The result,
+    The mean is relative to its median over pixels that are not black, and `DARK` is added before the logarithm. The result,
     (H, W) float64, does not depend on exposure, white balance, vignetting and slow shading; it is 0 if all pixels are black.
     """
     from scipy.ndimage import gaussian_filter
@@ -108,6 +108,7 @@ def feature_image(image: np.ndarray, usable: np.ndarray) -> np.ndarray:
     grey = np.log(DARK + grey / np.median(lit))
     weight = usable.astype(np.float64)
     sigma = max(2.0, 0.06 * image.shape[1])
+    # Blurred values over blurred weights: the mean over usable pixels around each pixel.
     around = gaussian_filter(grey * weight, sigma) / np.maximum(gaussian_filter(weight, sigma), 1e-6)
     out = np.where(usable, grey - around, 0.0)
     return np.clip(out / 0.35, -3.0, 3.0)
@@ -124,10 +125,14 @@ def mesh_edges(depth: np.ndarray, normal: np.ndarray, usable: np.ndarray) -> tup
         for step in (1, -1):
             other, turned = np.roll(depth, step, axis), np.roll(normal, step, axis)
             both = (depth > 0) & (other > 0) & usable
+            # `roll` wraps around, so border pixels have no neighbour on one side.
             both[[0, -1]], both[:, [0, -1]] = False, False
+            # A silhouette belongs to its nearer side, which is this pixel. At a crease the depth is continuous and the normal
+            # turns.
             jump = both & (other > 1.05 * depth)
             bend = both & (np.abs(other / np.maximum(depth, 1e-9) - 1) < 0.05) & ((normal * turned).sum(-1) < 0.87)
             found = np.argwhere(jump | bend)
+            # (row, column) becomes (u, v) of the pixel centre, then half a pixel towards the neighbour.
             at = found[:, ::-1] + 0.5
             at[:, 1 - axis] -= 0.5 * step
             coordinates.append(at)
@@ -170,6 +175,9 @@ def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = T
     """
     if not photos:
         raise InputError("registration: no photograph given; at least one is needed")
+
+    # -------- features, shared surface points, edges of the mesh --------
+    # Blocks of surface are held out from both kinds of rows, for the decision at the end.
     start = state = _Cameras.of(photos)
     features = [feature_image(p.image, p.usable) for p in photos]
     rows = _overlap(photos, features, points)
@@ -177,12 +185,18 @@ def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = T
     held = [_held_out(world) for world in edges]
     fit = rows.take(~rows.held_out)
     seen = [world[~h] for world, h in zip(edges, held, strict=True)]
+    # Unknowns: a twist of each view, then principal point and log focal length.
     free = np.r_[np.repeat(poses, 6 * len(photos)), np.repeat(intrinsics, 3)].astype(bool)
+
+    # -------- Gauss-Newton, from blurred to sharp --------
+    # A linear model of an image holds within its blur: wide blurs bring cameras close, narrow ones make them precise.
     for blur in BLURS if free.any() else ():
         maps = [_Maps.of(f, blur) for f in features]
         for _ in range(STEPS_PER_BLUR):
             step = _step(photos, maps, state, fit, seen, free)
             state = state.moved(step)
+
+    # -------- decision on held-out surface (Eq. C.32) --------
     maps = [_Maps.of(f, BLURS[-1]) for f in features]
     unseen = [world[h] for world, h in zip(edges, held, strict=True)]
     spread, gain, error = _compare_features(photos, maps, (start, state), rows.take(rows.held_out))
@@ -224,6 +238,7 @@ class _Cameras:
     def moved(self, step: np.ndarray) -> _Cameras:
         views = len(self.pose)
         twist = step[: 6 * views].reshape(views, 6)
+        # A twist acts in the camera's frame: X' = X - omega x X - tau to first order.
         pose = np.array([a @ _exponential(x) for a, x in zip(self.pose, twist, strict=True)])
         common = step[6 * views :]
         return replace(
@@ -239,6 +254,7 @@ def _exponential(twist: np.ndarray) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     out = np.eye(4)
+    # The translation is taken as it stands, which differs from the exponential map in second order only.
     out[:3, :3], out[:3, 3] = Rotation.from_rotvec(twist[:3]).as_matrix(), twist[3:]
     return out
 
@@ -277,6 +293,7 @@ class _Maps:
     def at(self, names: Sequence[str], uv: np.ndarray) -> list[np.ndarray]:
         """Interpolate bilinearly at pixel coordinates (n, 2)."""
         h, w = self.value.shape
+        # Pixel centres lie at + 0.5. The limits keep all four neighbours inside.
         x, y = np.clip(uv[:, 0] - 0.5, 0, w - 1.001), np.clip(uv[:, 1] - 0.5, 0, h - 1.001)
         i, j = x.astype(int), y.astype(int)
         a, b = x - i, y - j
@@ -304,10 +321,11 @@ def _jacobian(photo: Photo, state: _Cameras, local: np.ndarray, du: np.ndarray, 
     """Derivatives of an image value by the twist (n, 6) and by principal point and log focal length (n, 3) (Eq. C.31)."""
     x, y, z = local[:, 0], local[:, 1], np.maximum(local[:, 2], 1e-6)
     fx, fy = photo.focal[0] * state.focal, photo.focal[1] * state.focal
+    # G of Eq. C.31: gradient of the image value by the camera coordinates.
     gx, gy = du * fx / z, dv * fy / z
     gz = -(gx * x + gy * y) / z
     # x' = x - omega x x - t, so d x' / d omega = [x]_x and d x' / d t = -1.
-    turn = np.stack([gy * z - gz * y, gz * x - gx * z, gx * y - gy * x], -1)
+    turn = np.stack([gy * z - gz * y, gz * x - gx * z, gx * y - gy * x], -1)  # G x X
     shift = -np.stack([gx, gy, gz], -1)
     scale = du * fx * (x / z + state.principal[0]) + dv * fy * (y / z + state.principal[1])
     return np.concatenate([turn, shift], -1), np.stack([du * fx, dv * fy, scale], -1)
@@ -338,13 +356,16 @@ def _overlap(photos: Sequence[Photo], features: Sequence[np.ndarray], points: in
         h, w = p.depth.shape
         i, j = np.floor(uv[:, 0]).astype(int), np.floor(uv[:, 1]).astype(int)
         ok = (local[:, 2] > 0.05) & (i >= 2) & (j >= 2) & (i < w - 2) & (j < h - 2)
+        # A projection falls between pixels, so its neighbours must be such surface too.
         safe = minimum_filter(inside, 3)
         found = np.flatnonzero(ok)
         found = found[safe[j[found], i[found]]]
+        # Surface in front hides a point whose depth differs from the depth seen there.
         near = np.abs(p.depth[j[found], i[found]] - local[found, 2]) < 0.02 * local[found, 2]
         point.append(found[near])
         view.append(np.full(int(near.sum()), v))
     number, view = np.concatenate(point), np.concatenate(view)
+    # A held-out view sets no level, so two others must show the point.
     moving = np.array([not p.held for p in photos])
     count = np.bincount(number[moving[view]], minlength=len(everything))
     keep = count[number] >= 2
@@ -355,6 +376,7 @@ def _overlap(photos: Sequence[Photo], features: Sequence[np.ndarray], points: in
 def _held_out(world: np.ndarray) -> np.ndarray:
     """Which of the points (n, 3) are held out, (n,) bool: whole blocks of surface."""
     block = np.floor(world / HELD_OUT_BLOCK).astype(np.int64)
+    # A hash spreads the held-out blocks over the scene; a block falls on one side with all of its points.
     return (block * np.array([73856093, 19349663, 83492791])).sum(1) % 1_000_003 % HELD_OUT_EVERY == 0
 
 
@@ -363,6 +385,7 @@ def _inner(photo: Photo) -> np.ndarray:
     from scipy.ndimage import maximum_filter, minimum_filter
 
     depth = photo.depth
+    # Similar depth in a window of 5 x 5 pixels: no silhouette within two pixels.
     low, high = minimum_filter(depth, 5), maximum_filter(depth, 5)
     rays = _rays(photo)
     facing = np.abs((photo.normal * (rays @ photo.pose[:3, :3].T)).sum(-1)) / np.linalg.norm(rays, axis=-1)
@@ -428,6 +451,7 @@ def _step(
     step = np.zeros(len(right))
     if len(unknowns):
         step[unknowns] = np.linalg.solve(normal[np.ix_(unknowns, unknowns)], right[unknowns])
+    # rad, m, and units of the focal length. The step takes images for linear, which holds over short distances only.
     limit = np.r_[np.tile(np.repeat([0.02, 0.03], 3), views), [0.02, 0.02, 0.02]]
     return np.clip(step, -limit, limit)
 
@@ -440,6 +464,8 @@ def normal_equations(
 
     views = len(photos)
     size = 6 * views + 3
+
+    # -------- residuals and derivatives, a row for each (point, view) --------
     value, du, dv = _values(photos, maps, state, rows, ("value", "du", "dv"))
     moving = np.array([not p.held for p in photos], np.float64)[rows.view]
     jacobian, common = np.zeros((len(value), 6)), np.zeros((len(value), 3))
@@ -447,18 +473,27 @@ def normal_equations(
         own = np.flatnonzero(rows.view == v)
         local = _camera_points(state, v, rows.world[own])
         jacobian[own], common[own] = _jacobian(photo, state, local, du[own], dv[own])
+
+    # -------- weights of Cauchy's loss, in units of 1 / scale^2 --------
     residual = value - _level(value, moving, rows.point)
     own = np.abs(residual[moving > 0])
     scale = max(1.4826 * float(np.median(own)) if len(own) else 1.0, 1e-3)
     weight = 1.0 / (1.0 + (residual / (2.385 * scale)) ** 2) / scale**2
+
+    # -------- sparse Jacobian (rows, 6 V + 3) --------
     # A held-out photograph changes its own twist only, not the intrinsics and not the levels.
     common *= moving[:, None]
     mean = _level(value, weight * moving + 1e-9, rows.point)
+    # Each row has nine entries: the twist of its view, and the three common unknowns.
     number = np.arange(len(value))
     at = 6 * rows.view[:, None] + np.arange(6)
     columns = np.concatenate([at, np.tile(6 * views + np.arange(3), (len(value), 1))], 1)
     entries = np.concatenate([jacobian, common], 1)
     matrix = coo_matrix((entries.ravel(), (np.repeat(number, 9), columns.ravel())), (len(value), size)).tocsr()
+
+    # -------- levels of the points eliminated --------
+    # For fixed cameras C_s is the weighted mean of its rows, so its derivative is the weighted mean of theirs. It is taken from
+    # each of them.
     level = weight * moving
     total = np.maximum(np.bincount(rows.point, level), 1e-9)
     pooled = coo_matrix((level, (rows.point, number)), (len(total), len(value))).tocsr() @ matrix
@@ -468,9 +503,12 @@ def normal_equations(
     weighted = centred.multiply(weight[:, None]).tocsr()
     normal = np.asarray((centred.T @ weighted).todense())
     right = -np.asarray(weighted.T @ (value - mean)).ravel()
+
+    # -------- edges and priors, second to fourth sum of Eq. C.30 --------
     _add_edges(photos, maps, state, edges, normal, right)
     precision = np.r_[np.tile(np.repeat([SIGMA_ROTATION, SIGMA_TRANSLATION], 3), views), [SIGMA_PRINCIPAL] * 2, SIGMA_FOCAL] ** -2
     precision *= max(len(value) / max(views, 1) / 200.0, 1.0)  # the errors of neighbouring rows are correlated
+    # The prior pulls towards the given cameras, hence towards the negative sum of all steps so far.
     sum_of_steps = np.r_[state.twist.ravel(), state.principal, np.log(state.focal)]
     normal[np.diag_indices(size)] += precision
     right -= precision * sum_of_steps
@@ -494,8 +532,10 @@ def _add_edges(
         own, common = _jacobian(photo, state, local, du, dv)
         whole = np.concatenate([own, common * (not photo.held)], 1)
         at = np.r_[6 * v + np.arange(6), last]
+        # 1 / sigma_E^2 of Eq. C.30, from the residuals of the view.
         weight = EDGE_WEIGHT / max(float(np.var(1 - value)), 1e-3)
         normal[np.ix_(at, at)] += weight * whole.T @ whole
+        # The residual is 1 - E; its derivative is minus the Jacobian of E, hence the sign.
         right[at] += weight * whole.T @ (1 - value)
 
 
@@ -507,6 +547,7 @@ def _compare_features(
     if not len(rows.view):
         return (0.0, 0.0), 0.0, np.inf
     spread = [float(1.4826 * np.median(np.abs(r))) for r in residual]
+    # One width for both states, or the better one would be judged by a narrower loss.
     width = max(2.385 * spread[0], 1e-6)
     loss = np.log1p((residual[0] / width) ** 2) - np.log1p((residual[1] / width) ** 2)
     return (spread[0], spread[1]), *_by_cluster(loss, rows.view)
@@ -538,6 +579,7 @@ def _quality(
     views = len(photos)
     agreement, shift = np.zeros(views), np.zeros(views)
     value, du, dv = _values(photos, maps, state, rows, ("value", "du", "dv"))
+    # Mean of the other views: a view must not agree with itself.
     total, count = np.bincount(rows.point, value), np.bincount(rows.point)
     others = (total[rows.point] - value) / np.maximum(count[rows.point] - 1, 1)
     metres = np.zeros(len(value))
@@ -545,11 +587,13 @@ def _quality(
         own = np.flatnonzero(rows.view == v)
         if len(own) < MIN_ROWS:
             continue
+        # Footprint of a pixel, in metres across the line of sight.
         metres[own] = np.maximum(_camera_points(state, v, rows.world[own])[:, 2], 1e-6) / photo.focal[0]
         a, b = value[own] - value[own].mean(), others[own] - others[own].mean()
         agreement[v] = float((a * b).sum() / max(np.sqrt((a**2).sum() * (b**2).sum()), 1e-12))
         slope, gap = np.stack([du[own], dv[own]], -1), value[own] - others[own]
         robust = 1.0 / (1.0 + (gap / max(3.5 * np.median(np.abs(gap)), 1e-6)) ** 2)
+        # Two unknowns, the shift in u and v (Eq. C.33). The ridge serves views without any gradient.
         normal = slope.T @ (robust[:, None] * slope) + 1e-9 * np.eye(2)
         shift[v] = float(np.hypot(*np.linalg.solve(normal, slope.T @ (robust * gap))))
     seen = metres > 0
@@ -575,6 +619,7 @@ def _by_cluster(loss: np.ndarray, cluster: np.ndarray) -> tuple[float, float]:
         return 0.0, np.inf
     total, count = np.bincount(cluster, loss), np.bincount(cluster)
     mean = float(total.sum() / count.sum())
+    # Variance of the sums over clusters, with the correction for a small number of them.
     spread = (total - mean * count)[count > 0]
     size = len(spread)
     return mean, float(np.sqrt((spread**2).sum() * size / max(size - 1, 1)) / count.sum())

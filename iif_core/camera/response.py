@@ -142,13 +142,16 @@ class Response:
         """x^p(x) and its derivatives, with the parabola near 0."""
         theta = self.params
         count = theta.shape[-1]
+
+        # -------- exponent p(x), its derivatives by x and by the parameters --------
+        # Below the toe everything is evaluated at its end, where the parabola takes over; the logarithm never meets 0.
         z = np.maximum(x, _TOE)
         log_z = np.log(z)
         if self.family == "gamma":
             p = 1.0 / theta[..., 0] + 0.0 * z
             dp_dx = np.zeros_like(z)
             dp = np.broadcast_to(-1.0 / theta[..., 0] ** 2, z.shape)[..., None]
-            ddp_dx = np.zeros((*z.shape, 1))
+            ddp_dx = np.zeros((*z.shape, 1))  # of dp/dx by the parameters
         else:
             a0, a1, a2 = theta[..., 0], theta[..., 1], theta[..., 2]
             p = np.exp(a0 + z * (a1 + z * a2))
@@ -157,6 +160,8 @@ class Response:
             powers = np.stack([np.ones_like(z), z, z * z], -1)
             dp = p[..., None] * powers
             ddp_dx = dp * polynomial_slope[..., None] + p[..., None] * np.stack([np.zeros_like(z), np.ones_like(z), 2.0 * z], -1)
+
+        # -------- x^p, and the parabola below the toe (Eq. C.15) --------
         y = np.exp(p * log_z)
         rate = dp_dx * log_z + p / z  # d log f / dx
         slope = y * rate
@@ -164,16 +169,20 @@ class Response:
         any_toe = bool(toe.any())
         t = np.where(toe, x / _TOE, 1.0)
         q = z * rate  # local exponent at the end of the toe
+        # Equal value and slope at the end of the toe make the curve and its derivative continuous.
         f = np.where(toe, y * t * ((2.0 - q) + (q - 1.0) * t), y) if any_toe else y
         slope_out = np.where(toe, y / _TOE * ((2.0 - q) + 2.0 * (q - 1.0) * t), slope) if any_toe else slope
         if not jacobian:
             empty = np.zeros((*x.shape, count))
             return f, slope_out, empty, empty
+
+        # -------- derivatives by the parameters --------
         dy = (y * log_z)[..., None] * dp
         drate = ddp_dx * log_z[..., None] + dp / z[..., None]
         dslope = dy * rate[..., None] + y[..., None] * drate
         if not any_toe:
             return f, slope_out, dy, dslope
+        # In the toe the parameters act through the value y and the exponent q at its end; x / x_t is fixed.
         dq = z[..., None] * drate
         shape = (t * ((2.0 - q) + (q - 1.0) * t))[..., None]
         df_toe = dy * shape + y[..., None] * dq * (t * (t - 1.0))[..., None]
@@ -184,9 +193,11 @@ class Response:
     def _knots(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rises (..., K), heights (..., K + 1) and slopes (..., K + 1) of the spline at its knots."""
         bins = self.params.shape[-1] // 2
+        # Softmax with the last logit fixed at 0: rises are positive, add up to 1 and have K - 1 parameters.
         rise = np.exp(np.concatenate([self.params[..., : bins - 1], np.zeros((*self.params.shape[:-1], 1))], -1))
         rise /= rise.sum(-1, keepdims=True)
         height = np.concatenate([np.zeros_like(rise[..., :1]), np.cumsum(rise, -1)], -1)
+        # The last height is 1 up to rounding of the sum.
         return rise, height / height[..., -1:], np.exp(self.params[..., bins - 1 :])
 
     def _spline(self, x: np.ndarray, jacobian: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -196,27 +207,38 @@ class Response:
         """
         rise, height, slopes = self._knots()
         bins = rise.shape[-1]
+
+        # -------- u = x^0.45 and du/dx, with the parabola of Eq. C.15 near 0 --------
+        # The exponent is constant, so it is q as well.
         t = np.minimum(x / _TOE, 1.0)
         z = np.maximum(x, _TOE)
         u, p = z**_SPLINE_POWER, _SPLINE_POWER
         rate = np.where(x < _TOE, ((2.0 - p) + 2.0 * (p - 1.0) * t) / _TOE, p / z) * u  # du/dx
         u = u * t * ((2.0 - p) + (p - 1.0) * t)
+
+        # -------- bin of each value, and what Eq. C.14 needs there --------
         j = np.minimum((u * bins).astype(np.int64), bins - 1)
         at = (j,) if self.params.ndim == 1 else (np.broadcast_to(np.arange(len(self.params)), x.shape), j)
         nxt = (*at[:-1], j + 1)
         h, low, d0, d1 = rise[at], height[at], slopes[at], slopes[nxt]
         xi = u * bins - j
         s, q = h * bins, xi * (1.0 - xi)
+
+        # -------- S and dS/du --------
         above, below = s * xi**2 + d0 * q, s + (d0 + d1 - 2.0 * s) * q
         f = low + h * above / below
         end = s**2 * (d1 * xi**2 + 2.0 * s * q + d0 * (1.0 - xi) ** 2) / below**2  # dS/du
         if not jacobian:
             empty = np.zeros((*x.shape, 2 * bins))
             return f, end * rate, empty, empty
+
+        # -------- derivatives by rises and slopes --------
+        # h enters directly and through s = h K.
         df, dslope = np.zeros((*x.shape, 2 * bins)), np.zeros((*x.shape, 2 * bins))
         by_h = above / below + s * (xi**2 * below - above * (1.0 - 2.0 * q)) / below**2
         knot = np.arange(bins + 1)
         by_d0, by_d1 = h * q * (below - above) / below**2, -h * q * above / below**2
+        # Slopes are exponentials of their parameters, hence the factors d0 and d1.
         df[..., bins - 1 :] = (by_d0 * d0)[..., None] * (knot == j[..., None]) + (by_d1 * d1)[..., None] * (
             knot == j[..., None] + 1
         )
@@ -233,8 +255,10 @@ class Response:
         j = np.clip(np.searchsorted(height, y, side="right") - 1, 0, bins - 1)
         h, d0, d1, part = rise[j], slopes[j], slopes[j + 1], y - height[j]
         s = h * bins
+        # Eq. C.14 times its denominator is a quadratic in xi: a xi^2 + b xi + c = 0.
         bend = part * (d0 + d1 - 2.0 * s)
         a, b, c = h * (s - d0) + bend, h * d0 - bend, -s * part
+        # This form of the root stays finite where a vanishes.
         xi = 2.0 * c / (-b - np.sqrt(np.maximum(b**2 - 4.0 * a * c, 0.0)))
         u, p = (j + xi) / bins, _SPLINE_POWER
         return _invert_power(u, p)
@@ -252,11 +276,13 @@ class Response:
             x = self._inverse_spline(inside)
         else:
             x = self._invert_by_table(inside)
+        # Beyond the range of the sensor: the inverse of the straight lines of Eq. C.16.
         ends = self.derivative(np.array([0.0, 1.0]))
         return x + (y - inside) / np.where(y < 0, ends[0], ends[1])
 
     def _invert_by_table(self, y: np.ndarray) -> np.ndarray:
         """Bracket the solution with a table of 2049 values and refine it by Newton steps safeguarded by bisection."""
+        # Fourth powers put most of the grid near 0, where curves are steep.
         grid = np.linspace(0.0, 1.0, 2049) ** 4
         table = self(grid)
         j = np.clip(np.searchsorted(table, y, side="right") - 1, 0, len(grid) - 2)
@@ -264,6 +290,7 @@ class Response:
         x = low + (high - low) * (y - table[j]) / (table[j + 1] - table[j])
         for _ in range(8):
             f, slope, _ = self._evaluate(x)
+            # The bracket shrinks around the solution. A Newton step that leaves it is replaced by bisection.
             low, high = np.where(f <= y, x, low), np.where(f >= y, x, high)
             newton = x - (f - y) / slope
             x = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
@@ -273,6 +300,7 @@ class Response:
 def _invert_power(y: np.ndarray, p: float) -> np.ndarray:
     """x with x^p = y; below the end of the toe, with y = y_t t ((2 - p) + (p - 1) t) for x = t x_t (Eq. C.15)."""
     low = np.minimum(y / _TOE**p, 1.0)
+    # Root of the quadratic of Eq. C.15, in the form that has no cancellation near 0.
     t = 2.0 * low / ((2.0 - p) + np.sqrt(np.maximum((2.0 - p) ** 2 + 4.0 * (p - 1.0) * low, 0.0)))
     return np.where(low < 1.0, _TOE * t, y ** (1.0 / p))
 
@@ -327,6 +355,7 @@ def sampled_response(x: np.ndarray, y: np.ndarray) -> Response:
     if np.any(np.maximum(raw, 0.0).sum(-1) <= 0):
         raise InputError("response samples: the curve never rises; check the order of the samples")
     span = np.maximum(raw, 0.0).sum(-1, keepdims=True)
+    # Flat and falling pieces rise by the least that an inverse needs.
     increments = np.maximum(raw / span, _MIN_INCREMENT)
     values = np.concatenate([np.zeros((*y.shape[:-1], 1)), np.cumsum(increments, -1)], -1)
     values /= values[..., -1:]
@@ -341,6 +370,7 @@ def project(family: str, params: np.ndarray) -> np.ndarray:
     elif family == "ggcm":
         a0 = np.clip(theta[..., 0], *_A0_BOUNDS)
         a1 = np.clip(theta[..., 1], -_A_BOUND, _SLOPE_BOUND)
+        # P' = a1 + 2 a2 x is linear, so it is largest at an end of [0, 1]: a1 at 0, a1 + 2 a2 at 1.
         a2 = np.minimum(np.clip(theta[..., 2], -_A_BOUND, _A_BOUND), (_SLOPE_BOUND - a1) / 2.0)
         theta = np.stack([a0, a1, a2], -1)
     elif family == "spline":

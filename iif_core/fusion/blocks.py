@@ -45,6 +45,7 @@ def covisibility_weight(viewpoints: NDArray, floor: float) -> NDArray:
     The value of a cell that one viewpoint sees is the view's own mixture and carries no evidence about the view's maps. The
     floor keeps a value for segments that share no cell; without it their texture would collapse to a constant.
     """
+    # A cell without a viewpoint holds no pixel; the 1 only keeps its factor finite.
     return (1 - 1 / np.maximum(viewpoints, 1) + floor).astype(np.float32)
 
 
@@ -57,7 +58,9 @@ def make_block(problem: FusionProblem, view: int) -> tuple[Block, list[Dropped]]
     maps = problem.view(view)
     words = kernels.as_words(maps)
     found = usable_pixels(problem, view, maps, kernels.finite_pixels(words))
+    # (K, 5, n): the pixels of one channel of one prediction are adjacent, as the loops of the kernels run over them.
     values, inside = kernels.gather(words, found.pixel, found.usable)
+    # The pixels are in segment order, so the first index of an id is where its segment starts.
     segments, start = np.unique(found.segment, return_index=True)
     block = Block(
         values,
@@ -66,6 +69,7 @@ def make_block(problem: FusionProblem, view: int) -> tuple[Block, list[Dropped]]
         segments.astype(np.int32),
         np.append(start, len(found.pixel)).astype(np.int64),
         found.usable,
+        # An empty mask spares SegmentSums a second Gram matrix.
         np.zeros((0, 0), bool) if inside.all() else inside,
         problem.stated_scale(view, found.pixel),
     )
@@ -86,5 +90,5 @@ class Blocks:
         if block.nbytes <= self._left:
             self._left -= block.nbytes
             self._kept[view] = block
-        elif self._spill is not None:
+        elif self._spill is not None:  # only what has K entries a pixel; the rest is small
             self._kept[view] = replace(block, values=self._spill(block.values), inside=self._spill(block.inside))

@@ -59,17 +59,21 @@ def solve_direct(
     if chosen is not None and options.objective != "distribution":
         raise InputError("a given selection needs objective `distribution`; least squares selects for itself")
     means = options.variant in ("texel_mean", "object_mean")
+    # The maps of a mean are the identity, so a second sweep would change nothing. With a given selection,
+    # `minimise_distribution_loss` starts maps and texture again, so further sweeps would be lost.
     sweeps = 1 if means or chosen is not None else options.sweeps
     polishing = options.polish if options.objective == "distribution" and not means else 0
-    total = sweeps + polishing + 2
+    total = sweeps + polishing + 2  # 2: the first pass, and the one that measures the scales
 
     def notify(done: int) -> None:
         if progress is not None:
             progress(done, total)
 
+    # -------- maps, selection and texture in turn (Eq. F.23 to F.30) --------
     run, texture = first_pass(problem, options, threads)
     notify(1)
     texture, history = _alternate(run, texture, sweeps, notify)
+    # -------- the paper's loss, which holds the level itself; or else the seams between parts (Eq. F.41 to F.43) --------
     if polishing:
         chosen = fix_selection(run.state, run.sums, chosen)
         texture = minimise_distribution_loss(run, chosen, texture, history, notify)
@@ -77,8 +81,10 @@ def solve_direct(
         spread = _level_spread(run.parts, run.sums)
         shift, _ = seam_shifts(run.parts, texture, run.counts.weight, problem.neighbours, spread)
         texture = _shifted(run.parts, shift, texture, run.state)
+    # -------- range, errors, description --------
     texture = np.clip(texture, LOWEST, 1.0)
     if polishing:
+        # The state still has the errors of the maps of the least squares.
         measure_errors(run, texture)
     if options.variant == "object_mean":
         object_value, _ = object_means(texture, problem.object_of_cell, run.counts.weight)
@@ -113,11 +119,13 @@ def describe_fit(
     Raises:
         InputError: shapes that do not match, ids out of range, a segment in two views.
     """
+    # Only the first texture depends on the variant, and nothing here reads it.
     run, _ = first_pass(problem, FusionOptions("texel_mean", memory=memory), threads)
     run.state.affine, run.state.alpha = affine.astype(np.float64), weight.astype(np.float64)
     texture = np.clip(value, LOWEST, 1.0).astype(np.float32)
     measure_errors(run, texture)
     result = build_result(run, texture, history or [])
+    # Cells without weight have no scale of the solver; they keep the fill of `build_result`.
     own = np.where((run.counts.weight > 0)[:, None], scale, result.scale).astype(np.float32)
     return replace(result, scale=own)
 
@@ -131,13 +139,17 @@ def _alternate(
     history: list[dict[str, float]] = []
     for sweep in range(sweeps):
         temperature = max(options.temperature * options.anneal**sweep, options.final_temperature)
+        # However few sweeps there are, the last one selects at the final temperature (Eq. F.29).
         if sweep == sweeps - 1:
             temperature = options.final_temperature
         cells = CellSums(run.problem.n_cells)
         for block, mixed in run.map_views(partial(_sweep_view, run, texture, temperature)):
+            # From the second sweep on, the texture consists of corrected predictions, and a distance from it marks an outlier
+            # (text after Eq. F.30).
             cells.add(block.cell, mixed, _robust_weight(block, mixed, texture, options) if sweep else block.weight)
         updated = cells.mean(texture)
         if options.variant not in ("texel_mean", "object_mean"):
+            # The reference is the first texture, whose level is set by the medians of the raw predictions (Eq. F.38).
             shift = anchor_shifts(run.parts, first, updated, counts.weight)
             updated = _shifted(run.parts, shift, updated, state)
         seen = counts.weight > 0
@@ -156,21 +168,25 @@ def _sweep_view(run: FusionPass, texture: NDArray, temperature: float, view: int
     options, sums, state = run.options, run.sums, run.state
     block = run.blocks(view)
     rows = block.segments
+    # -------- affine maps (Eq. F.25), float64, from products (s, K, CROSS) --------
     values, target = block.values, kernels.texture_at(texture, block.cell)
     weight = sums.fit_weight(block)
     cross = kernels.cross(values, target, weight, block.start, NO_MASK)
     if options.variant in ("full", "uniform"):
         albedo = cross
         if sums.masked[rows].any():
+            # Where the Gram matrix leaves out clipped pixels, the products must leave out the same ones.
             inside = kernels.cross(values, target, weight, block.start, block.inside)
             albedo = np.where(sums.masked[rows][..., None], inside, cross)
         state.affine[rows] = sums.corrections(rows, cross, albedo)
+    # -------- errors over all pixels, clipped ones too (Eq. F.27), and selection by them (Eq. F.28) --------
     square = kernels.square(target, weight, block.start)
     state.error[rows] = sums.errors(rows, state.affine[rows], cross, square)
     if options.variant == "full" and len(rows):
         for p in range(3):
             state.alpha[rows, :, p] = selection_weights(state.error[rows, :, p], temperature, sums.usable[rows])
     alpha = state.alpha[rows]
+    # -------- mixture (Eq. F.30): the weight of a property scales its map, so one pass forms the sum of alpha_k T_k v_k --------
     blend = (state.affine[rows] * alpha[..., PROPERTY_OF_ENTRY]).astype(np.float32)
     return block, kernels.mixture(values, blend, block.start, LOWEST)
 
@@ -180,12 +196,14 @@ def _shifted(parts: Parts, shift: NDArray, texture: NDArray, state: SegmentState
     if not parts.count:
         return texture
     state.affine[..., _BIAS] += shift[parts.of_segment][:, None, :]
+    # Cells without a part have the number -1, which reads the last row; the condition discards what it read.
     of_cell = np.where((parts.of_cell >= 0)[:, None], shift[parts.of_cell], 0)
     return texture + of_cell.astype(np.float32)
 
 
 def _level_spread(parts: Parts, sums: SegmentSums) -> NDArray:
     """(parts, 5) standard deviation over the predictions of a segment's mean, weighted mean over the part's segments."""
+    # Entries of GRAM that sum r, g, b, roughness and metallic: the weighted mean of each raw prediction, (S, K, 5).
     means = sums.gram[:, :, [6, 7, 8, 10, 12]] / np.maximum(sums.weight, 1e-30)[:, None, None]
     share = sums.usable / np.maximum(sums.usable.sum(1, keepdims=True), 1)
     centre = np.einsum("sk,skc->sc", share, means)
@@ -200,4 +218,5 @@ def _robust_weight(block: Block, mixed: NDArray, texture: NDArray, options: Fusi
     if not options.robust:
         return block.weight
     distance = mixed - kernels.texture_at(texture, block.cell)
+    # b_r is at its floor. b_p is a common factor, which cancels in the mean of a cell.
     return block.weight * laplace.kl_weight(distance, options.scale_floor, 1.0).astype(np.float32)

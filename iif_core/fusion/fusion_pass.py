@@ -60,14 +60,15 @@ def first_pass(problem: FusionProblem, options: FusionOptions, threads: int) -> 
     counts = CellCounts(*(np.zeros(problem.n_cells, t) for t in (np.int32, np.int32, np.int32, np.float64)))
     blocks, cells, n_k = Blocks(problem, options.memory, options.spill), CellSums(problem.n_cells), 0
     dropped: list[Dropped] = []
-    known: set[bytes] = set()
-    pairs = []
+    known: set[bytes] = set()  # digests of the maps of cells
+    pairs = []  # (segment, cell) of the pixels of each view
     n_views = len(problem.cell_of_pixel)
 
     def start_of(view: int) -> tuple[Block, list[Dropped], NDArray]:
         block, left_out = make_block(problem, view)
         return block, left_out, _first_values(block, options)
 
+    # -------- first loop: texture, counts, edges of the graph of parts --------
     for view, (block, left_out, values) in enumerate(map_in_order(start_of, n_views, threads)):
         n_k = n_k or len(block.usable)
         if len(block.usable) != n_k:
@@ -85,10 +86,13 @@ def first_pass(problem: FusionProblem, options: FusionOptions, threads: int) -> 
             known.add(digest)
             counts.viewpoints[seen] += 1
         pairs.append((np.repeat(block.segments, np.diff(block.start)), block.cell))
+    # All channels of a pixel weigh the same here, so the first one stands for all.
     counts.weight = cells.total[:, 0]
+    # -------- second loop: Gram matrices, whose weights need the viewpoints from all views (Eq. F.24) --------
     sums = SegmentSums(problem.n_segments, max(n_k, 1), covisibility_weight(counts.viewpoints, options.single_view_weight))
     for block in map_in_order(blocks, n_views, threads):
         sums.add(block, options)
+    # -------- identity maps, and equal weights of the usable predictions; 0 for a segment without any --------
     state = SegmentState(problem.n_segments, max(n_k, 1))
     share = sums.usable / np.maximum(sums.usable.sum(1, keepdims=True), 1)
     state.alpha = np.repeat(share[:, :, None], 3, 2)
@@ -101,6 +105,7 @@ def _first_values(block: Block, options: FusionOptions) -> NDArray:
     """(5, n) median of the usable predictions of each pixel, or their mean for the variants that average."""
     if options.variant in ("texel_mean", "object_mean"):
         share = np.float32(block.usable / max(block.usable.sum(), 1))
+        # Identity maps, each with its share, make the mixture a mean: (s, K, CROSS), equal for all segments.
         blend = np.broadcast_to(share[:, None] * np.float32(IDENTITY), (len(block.segments), len(share), kernels.CROSS))
         return kernels.mixture(block.values, np.ascontiguousarray(blend), block.start, LOWEST)
     return kernels.medians(block.values, block.usable, kernels.sorting_network(int(block.usable.sum())))

@@ -38,12 +38,15 @@ class Parts:
 
 def covisible_parts(n_segments: int, n_cells: int, pairs: list[tuple[NDArray, NDArray]]) -> Parts:
     """Find the parts of the graph whose edges are the (segment, cell) `pairs` of used pixels."""
+    # A segment meets a cell in many pixels; one edge for each pair is enough.
     keys = [np.unique(segment.astype(np.int64) * n_cells + cell) for segment, cell in pairs]
     segment, cell = np.divmod(np.concatenate([np.zeros(0, np.int64), *keys]), max(n_cells, 1))
+    # Nodes 0 ... S - 1 are the segments; the cells follow.
     label = component_labels(n_segments + n_cells, segment, n_segments + cell)
     of_segment, of_cell = label[:n_segments], label[n_segments:]
     seen = np.zeros(n_cells, bool)
     seen[cell] = True
+    # An unseen cell is a component by itself. It gets no number, and later systems stay as small as the parts.
     used, compact = np.unique(np.concatenate([of_segment, of_cell[seen]]), return_inverse=True)
     cells = np.full(n_cells, -1, np.int32)
     cells[seen] = compact[n_segments:]
@@ -65,7 +68,7 @@ def anchor_shifts(parts: Parts, level: NDArray, texture: NDArray, weight: NDArra
     total = np.bincount(of_cell, weight, parts.count)
     missing = level[seen] - texture[seen]
     sums = np.stack([np.bincount(of_cell, weight * missing[:, c], parts.count) for c in range(5)], 1)
-    return sums / np.where(total > 0, total, np.inf)[:, None]
+    return sums / np.where(total > 0, total, np.inf)[:, None]  # a part without weight does not move
 
 
 def seam_shifts(parts: Parts, texture: NDArray, weight: NDArray, neighbours: NDArray, spread: NDArray) -> tuple[NDArray, NDArray]:
@@ -86,19 +89,24 @@ def seam_shifts(parts: Parts, texture: NDArray, weight: NDArray, neighbours: NDA
     shift, count = np.zeros((parts.count, 5)), np.zeros(parts.count, np.int64)
     if parts.count == 0 or len(neighbours) == 0:
         return shift, count
+    # -------- pairs of cells (x, y) at a seam, x in the part with the lower number --------
     a, b = parts.of_cell[neighbours[:, 0]], parts.of_cell[neighbours[:, 1]]
     seam = (a >= 0) & (b >= 0) & (a != b)
     if not seam.any():
         return shift, count
+    # With one order of the parts, all jumps of a seam have the same sign.
     turned = a[seam] > b[seam]
     pairs = np.where(turned[:, None], neighbours[seam][:, ::-1], neighbours[seam])
     a, b = parts.of_cell[pairs[:, 0]].astype(np.int64), parts.of_cell[pairs[:, 1]].astype(np.int64)
-    jump = texture[pairs[:, 1]].astype(np.float64) - texture[pairs[:, 0]]
+    jump = texture[pairs[:, 1]].astype(np.float64) - texture[pairs[:, 0]]  # (m, 5), mu_y - mu_x
+    # -------- which seams are plausible as an error of level (Eq. F.42), (seams, 5) --------
     seams, of_pair, length = np.unique(a * parts.count + b, return_inverse=True, return_counts=True)
     mean = np.stack([np.bincount(of_pair, jump[:, c]) for c in range(5)], 1) / length[:, None]
     limit = MAX_LEVEL_JUMP * np.hypot(spread[seams // parts.count], spread[seams % parts.count])
+    # Where the predictions agree exactly the limit is 0, and the tolerance keeps rounding of the float32 texture from deciding.
     plausible = np.abs(mean) <= limit + 1e-6
     plausible[:, :3] = plausible[:, :3].all(1, keepdims=True)  # albedo is closed in all three channels or in none
+    # -------- one system for each property (Eq. F.43) --------
     for channels in (slice(0, 3), slice(3, 4), slice(4, 5)):
         used = plausible[of_pair, channels.start]
         if used.any():
@@ -113,13 +121,18 @@ def _solve_shifts(parts: Parts, a: NDArray, b: NDArray, jump: NDArray, weight: N
     from scipy.sparse.linalg import splu
 
     n, ones = parts.count, np.ones(len(a))
-    count = np.bincount(a, minlength=n) + np.bincount(b, minlength=n)
+    count = np.bincount(a, minlength=n) + np.bincount(b, minlength=n)  # m_P
+    # q_P is the share of a part in the weight of all parts that seams join to it, directly or through others.
     group = component_labels(n, a, b)
     seen = parts.of_cell >= 0
     size = np.bincount(parts.of_cell[seen], weight[seen], n)
     share = size / np.maximum(np.bincount(group, size)[group], 1e-30)
+    # Entries at one position add up, to -m_PQ off the diagonal.
     matrix = coo_matrix((np.concatenate([-ones, -ones]), (np.r_[a, b], np.r_[b, a])), (n, n)).tocsc()
+    # The matrix is symmetric and strictly diagonally dominant, hence regular: 1e-9 sees to it even where parts have no weight.
+    # One sparse factorisation serves all channels of the property.
     solver = splu(matrix + coo_matrix((count + SEAM_RIDGE_PAIRS * share + 1e-9, (np.arange(n),) * 2)).tocsc())
+    # A jump pulls its two parts towards each other.
     right = [np.bincount(a, jump[:, c], n) - np.bincount(b, jump[:, c], n) for c in range(jump.shape[1])]
     shift = np.stack([solver.solve(r) for r in right], 1)
     shift[count == 0] = 0

@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 
 from iif_core.reflectance import material
 
+# Pixels that are summed in float32 at a time, and the length of all scratch arrays.
 PIECE = 256
 _MATHS = {"reassoc", "contract", "nsz", "arcp"}  # no assumption about NaN or infinity
 _compiled = numba.njit(nogil=True, cache=True, fastmath=_MATHS)
+# Without reassociation, so that `add_to_cells` adds the pixels in their order.
 _exact = numba.njit(nogil=True, cache=True)
 # Loops that other loops call are inlined: docs/method/numerics.md#sums-that-depend-on-the-compiler.
 _inlined = numba.njit(nogil=True, cache=True, fastmath=_MATHS, forceinline=True)
@@ -43,10 +45,13 @@ def _widen(plane, bits, out, m):
 
 @overload(_widen, inline="always")
 def _widen_of(plane, bits, out, m):
+    # Half has 5 bits of exponent, biased by 15, and 10 of mantissa; float32 has 8, biased by 127, and 23. Shifted by the 13 bits
+    # of difference the number is too small by 2^(127 - 15). The product restores it, exactly for subnormal halves too
+    # (docs/method/numerics.md#half-precision-read-as-bits).
     if plane.dtype == types.uint16:  # half bits, finite and >= 0: shift exponent and mantissa into place, then scale
 
         def widen(plane, bits, out, m):
-            for i in range(m):
+            for i in range(m):  # writes the memory of `out`
                 bits[i] = np.int32(plane[i]) << 13
             for i in range(m):
                 out[i] *= np.float32(2.0**112)
@@ -82,7 +87,7 @@ def _is_finite(x):
 @overload(_is_finite, inline="always")
 def _is_finite_of(x):
     if x == types.uint16:
-        return lambda x: (x & 0x7C00) != 0x7C00
+        return lambda x: (x & 0x7C00) != 0x7C00  # all bits of the exponent: infinity or NaN
     return lambda x: np.isfinite(x)
 
 
@@ -94,6 +99,7 @@ def _unit(x):
 def _unit_of(x):
     """The value clamped to [0, 1] in its own representation; half bits of values in [0, 1] are ordered like integers."""
     if x == types.uint16:
+        # 0x8000 is the sign bit, 0x3C00 are the bits of 1. Minus zero becomes 0, as `_widen` needs it.
         return lambda x: np.uint16(0) if x >= 0x8000 else min(x, np.uint16(0x3C00))
     return lambda x: min(max(x, np.float32(0)), np.float32(1))
 
@@ -127,6 +133,7 @@ def gather(maps: NDArray, pixels: NDArray, usable: NDArray) -> tuple[NDArray, ND
     """Return the values (K, 5, n) of the pixels, clamped to [0, 1] and 0 where not usable, and (K, n) bool: no albedo
     channel is 0 or 1."""
     n_k, n = maps.shape[0], len(pixels)
+    # From pixel by pixel (K, N, 5) to plane by plane (K, 5, n), which the loops below read in order.
     out = np.zeros((n_k, 5, n), maps.dtype)
     inside = np.ones((n_k, n), np.bool_)
     for k in range(n_k):
@@ -175,6 +182,7 @@ def gram(values: NDArray, weight: NDArray, start: NDArray, keep: NDArray) -> NDA
     out = np.zeros((len(start) - 1, n_k, GRAM))
     masked = keep.shape[0] > 0
     w = np.empty(PIECE, np.float32)
+    # `bits` and `v` are one memory, which `_widen` needs. In these loops q is metallic, m counts the pixels of the piece.
     bits = np.empty((5, PIECE), np.int32)
     v = bits.view(np.float32)
     for s in range(len(start) - 1):
@@ -188,6 +196,7 @@ def gram(values: NDArray, weight: NDArray, start: NDArray, keep: NDArray) -> NDA
                 if masked:
                     for i in range(m):
                         w[i] = w[i] if keep[k, first + i] else np.float32(0)
+                # -------- moments of one piece, float32: aa = sum w a a, sa = sum w a, ... --------
                 aa = ab = ac = bb = bc = cc = sa = sb = sc = rr = sr = qq = sq = one = np.float32(0)
                 for i in range(m):
                     a, b, c_, r, q = v[0, i], v[1, i], v[2, i], v[3, i], v[4, i]
@@ -206,6 +215,7 @@ def gram(values: NDArray, weight: NDArray, start: NDArray, keep: NDArray) -> NDA
                     qq += wq * q
                     sq += wq
                     one += w[i]
+                # -------- over the pieces, float64 --------
                 o = out[s, k]
                 _add(o, (aa, ab, ac, bb, bc, cc, sa, sb, sc, rr, sr, qq, sq, one))
     return out
@@ -232,6 +242,7 @@ def cross(values: NDArray, target: NDArray, weight: NDArray, start: NDArray, kee
     for s in range(len(start) - 1):
         for first in range(start[s], start[s + 1], PIECE):
             m = min(PIECE, start[s + 1] - first)
+            # t is weight times texture, the same for all predictions; w only masks the clipped pixels of single ones.
             for c in range(5):
                 for i in range(m):
                     t[c, i] = weight[first + i] * target[c, first + i]
@@ -243,6 +254,7 @@ def cross(values: NDArray, target: NDArray, weight: NDArray, start: NDArray, kee
                 if masked:
                     for i in range(m):
                         w[i] = np.float32(1) if keep[k, first + i] else np.float32(0)
+                # -------- products of one piece, float32: ab = sum w mu_r v_g, ad = sum w mu_r, ...; q is metallic --------
                 aa = ab = ac = ad = ba = bb = bc = bd = ca = cb = cc = cd = rr = rd = qq = qd = np.float32(0)
                 for i in range(m):
                     a, b, c_ = v[0, i], v[1, i], v[2, i]
@@ -294,6 +306,7 @@ def _correct(values, k, first, m, t, bits, v, out, add):
                 out[c, i] = 0
     for i in range(m):
         a, b, c_ = v[0, i], v[1, i], v[2, i]
+        # t is a map of 16 numbers in the CROSS layout; 3, 7, 11, 13 and 15 are the offsets.
         out[0, i] += t[0] * a + t[1] * b + t[2] * c_ + t[3]
         out[1, i] += t[4] * a + t[5] * b + t[6] * c_ + t[7]
         out[2, i] += t[8] * a + t[9] * b + t[10] * c_ + t[11]
@@ -318,11 +331,12 @@ def mixture(values: NDArray, blend: NDArray, start: NDArray, low: NDArray) -> ND
     for s in range(len(start) - 1):
         for k in range(values.shape[0]):
             t = blend[s, k]
-            if not np.any(t != 0):
+            if not np.any(t != 0):  # has no weight in any property
                 continue
             for first in range(start[s], start[s + 1], PIECE):
                 m = min(PIECE, start[s + 1] - first)
                 _correct(values, k, first, m, t, bits, v, out[:, first : first + m], True)
+    # The clamp acts on the mixture, not on each prediction as in Eq. F.1.
     for c in range(5):
         for i in range(out.shape[1]):
             out[c, i] = min(max(out[c, i], low[c]), np.float32(1))
@@ -341,7 +355,7 @@ def add_to_cells(total: NDArray, summed: NDArray, cell: NDArray, value: NDArray,
     for i in range(len(cell)):
         x = cell[i]
         for c in range(5):
-            w = weight[0 if same else c, i]
+            w = weight[0 if same else c, i]  # float32; the sums are float64
             total[x, c] += w
             summed[x, c] += w * value[c, i]
 
@@ -368,6 +382,7 @@ def sorting_network(n: int) -> NDArray:
         >>> sorting_network(3).tolist()
         [[0, 1], [0, 2], [1, 2]]
     """
+    # p is the length of the runs that are in order already, k the distance between compared values.
     pairs = []
     p = 1
     while p < n:
@@ -375,7 +390,7 @@ def sorting_network(n: int) -> NDArray:
         while k >= 1:
             for j in range(k % p, n - k, 2 * k):
                 for i in range(min(k, n - j - k)):
-                    if (i + j) // (2 * p) == (i + j + k) // (2 * p):
+                    if (i + j) // (2 * p) == (i + j + k) // (2 * p):  # both lie in one pair of runs
                         pairs.append((i + j, i + j + k))
             k //= 2
         p *= 2
@@ -384,6 +399,7 @@ def sorting_network(n: int) -> NDArray:
 
 @_inlined_exact
 def _sort_planes(planes, network, m):
+    # planes (n, PIECE): a comparator puts the smaller value of every pixel into one plane, the larger into the other.
     for x in range(len(network)):
         low, high = planes[network[x, 0]], planes[network[x, 1]]
         for i in range(m):
@@ -409,7 +425,7 @@ def medians(values: NDArray, usable: NDArray, network: NDArray) -> NDArray:
             for j in range(n_used):
                 _widen(values[which[j], c, first : first + m], bits[j], planes[j], m)
             _sort_planes(planes, network, m)
-            low, high = planes[(n_used - 1) // 2], planes[n_used // 2]
+            low, high = planes[(n_used - 1) // 2], planes[n_used // 2]  # the same plane for an odd number
             for i in range(m):
                 out[c, first + i] = (low[i] + high[i]) * np.float32(0.5)
     return out
@@ -448,13 +464,14 @@ def disagreement(
     values, mixed, target, weight, start = pixels
     which = np.flatnonzero(usable)
     n_used = len(which)
+    # A block without a usable prediction has no pixel, and then none of the loops runs.
     b_ref = np.full(mixed.shape, np.float32(floor))
     votes = np.zeros((len(start) - 1, values.shape[0], 3))
     bits = np.empty((5, PIECE), np.int32)
     v = bits.view(np.float32)
-    corrected = np.empty((5, PIECE), np.float32)
-    planes = np.empty((5, n_used, PIECE), np.float32)
-    best = np.empty((3, PIECE), np.float32)
+    corrected = np.empty((5, PIECE), np.float32)  # v_k after its map; then its distance from the texture
+    planes = np.empty((5, n_used, PIECE), np.float32)  # |mixture - v_k|, to be sorted over k
+    best = np.empty((3, PIECE), np.float32)  # smallest L1 error of each property so far
     chosen = np.empty((3, PIECE), np.int64)
     error = np.empty((3, PIECE), np.float32)
     for s in range(len(start) - 1):
@@ -462,28 +479,31 @@ def disagreement(
             m = min(PIECE, start[s + 1] - first)
             best[:] = np.inf
             chosen[:] = 0
+            # -------- distances of each prediction from mixture and texture; the nearest one --------
             for j in range(n_used):
                 _correct(values, which[j], first, m, affine[s, which[j]], bits, v, corrected, False)
                 for c in range(5):
                     for i in range(m):
-                        x = min(max(corrected[c, i], low[c]), np.float32(1))
+                        x = min(max(corrected[c, i], low[c]), np.float32(1))  # clamp of Eq. F.1
                         planes[c, j, i] = abs(mixed[c, first + i] - x)
                         corrected[c, i] = abs(x - target[c, first + i])
                 for i in range(m):
+                    # Eq. F.11 without the factor 1 / 3, which changes no comparison.
                     error[0, i] = corrected[0, i] + corrected[1, i] + corrected[2, i]
                     error[1, i] = corrected[3, i]
                     error[2, i] = corrected[4, i]
                 for p in range(3):
                     for i in range(m):
-                        nearer = error[p, i] < best[p, i]
+                        nearer = error[p, i] < best[p, i]  # of equal errors the first stays
                         chosen[p, i] = which[j] if nearer else chosen[p, i]
                         best[p, i] = error[p, i] if nearer else best[p, i]
+            # -------- votes (Eq. F.13 for a temperature of 0) and scale (Eq. F.4) --------
             for p in range(3):
                 for i in range(m):
                     votes[s, chosen[p, i], p] += weight[first + i]
             for c in range(5):
                 _sort_planes(planes[c], network, m)
-                middle = planes[c, (n_used - 1) // 2]
+                middle = planes[c, (n_used - 1) // 2]  # lower median
                 for i in range(m):
                     b_ref[c, first + i] = max(middle[i], np.float32(floor))
     return b_ref, votes
@@ -500,6 +520,7 @@ def choose(values: NDArray, chosen: NDArray, start: NDArray) -> NDArray:
     for s in range(len(start) - 1):
         a, b = start[s], start[s + 1]
         for c in range(5):
+            # max(c - 2, 0) is the property of a channel: 0 0 0 1 2.
             _widen(values[chosen[s, max(c - 2, 0)], c, a:b], bits[c, a:b], out[c, a:b], b - a)
     return out
 
@@ -519,6 +540,8 @@ def channel_moments(chosen: NDArray, target: NDArray, weight: NDArray, start: ND
     for s in range(len(start) - 1):
         for begin in range(start[s], start[s + 1], PIECE):
             end = min(begin + PIECE, start[s + 1])
+            # Each channel weighs a pixel by its own distance (Eq. F.33), so even the channels of albedo have different Gram
+            # matrices.
             for ch in range(3):
                 aa = ab = ac = bb = bc = cc = sa = sb = sc = one = ta = tb = tc = td = np.float32(0)
                 for i in range(begin, end):

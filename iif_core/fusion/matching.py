@@ -36,6 +36,7 @@ def penalised_affine(gram: NDArray, cross: NDArray, start: NDArray, strength: ND
         (S, 3, 4) float64.
     """
     n = len(gram)
+    # Block-diagonal matrix of the data term: the output channels couple through the regulariser alone.
     full = np.zeros((n, 12, 12))
     for c in range(3):
         full[:, 4 * c : 4 * c + 4, 4 * c : 4 * c + 4] = gram[:, c]
@@ -48,13 +49,17 @@ def penalised_affine(gram: NDArray, cross: NDArray, start: NDArray, strength: ND
 
     t = start.reshape(n, 12).astype(np.float64)
     value = objective(t)
-    weight = 2 * strength[:, None, None]
+    weight = 2 * strength[:, None, None]  # (S, 1, 1); the derivative of a square has a factor 2
     for _ in range(steps):
+        # -------- Gauss-Newton matrix and gradient (Eq. F.35) --------
+        # J'J replaces the second derivative of ||AA' - I||^2, which may be indefinite. The matrix is then at least 2 strength
+        # times the identity, so the solve is well posed and the step descends.
         residual, jacobian = _quartic_jacobian(t)
         hessian = full + weight * (np.eye(12) + jacobian.swapaxes(1, 2) @ jacobian)
         gradient = np.einsum("sij,sj->si", full, t) - right
         gradient += weight[..., 0] * ((t - identity) + np.einsum("sji,sj->si", jacobian, residual))
         step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
+        # -------- step length of each segment: the objective is quartic, and a full step may overshoot --------
         length = np.ones(n)
         for _ in range(4):
             trial = t - length[:, None] * step
@@ -72,8 +77,10 @@ def _quartic_jacobian(t: NDArray) -> tuple[NDArray, NDArray]:
     """AA' - I as (S, 9) and its derivative (S, 9, 12) with respect to the entries of T."""
     n = len(t)
     a = t.reshape(n, 3, 4)[:, :, :3]
+    # All nine entries, so that off-diagonal ones count twice, as they do in the Frobenius norm.
     residual = (a @ a.swapaxes(1, 2) - np.eye(3)).reshape(n, 9)
     jacobian = np.zeros((n, 3, 3, 3, 4))
+    # (AA')_ij = A_i . A_j with the rows of A: its derivative is A_j in row i and A_i in row j, and both add up for i = j.
     for i in range(3):
         for j in range(3):
             jacobian[:, i, j, i, :3] += a[:, j]

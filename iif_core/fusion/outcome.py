@@ -19,6 +19,7 @@ def measure_errors(run: FusionPass, texture: NDArray) -> None:
     for block in run.map_views(run.blocks):
         rows, target = block.segments, kernels.texture_at(texture, block.cell)
         weight = run.sums.fit_weight(block)
+        # No mask: errors count all pixels, also those that the fit of the albedo map leaves out.
         cross = kernels.cross(block.values, target, weight, block.start, NO_MASK)
         square = kernels.square(target, weight, block.start)
         run.state.error[rows] = run.sums.errors(rows, run.state.affine[rows], cross, square)
@@ -37,7 +38,7 @@ def build_result(run: FusionPass, texture: NDArray, history: list[dict[str, floa
     for array in (scale, uncertainty):  # unseen cells are as uncertain as the least certain tenth of those seen
         array[~seen] = np.quantile(array[seen], 0.9, axis=0).astype(np.float32) if seen.any() else np.float32(0.5)
     n, k = state.alpha.shape[:2]
-    probability = votes / np.maximum(votes.sum(1, keepdims=True), 1e-30)
+    probability = votes / np.maximum(votes.sum(1, keepdims=True), 1e-30)  # 0 where a segment has no pixel
     by_property = state.error.swapaxes(1, 2), np.repeat(run.sums.usable[:, None], 3, 1)  # (S, 3, K)
     return FusionResult(
         value=np.where(seen[:, None], texture, object_value[object_of_cell]).astype(np.float32),

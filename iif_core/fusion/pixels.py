@@ -20,7 +20,10 @@ def relative_footprints(views: Iterable[tuple[NDArray, NDArray, NDArray, float]]
     """
     sizes = []
     for depth, direction, normal, focal in views:
+        # `direction` is not of unit length; the normals are.
         cosine = np.abs(np.einsum("hwi,hwi->hw", direction, normal)) / np.linalg.norm(direction, axis=-1)
+        # The footprint of a slanted pixel is 1 / cos times as large, so its mean side grows with the root. The floor keeps
+        # surface that is seen edge-on finite. NaN leaves the median to pixels with surface.
         sizes.append(np.where(depth > 0, depth, np.nan) / focal / np.sqrt(np.maximum(cosine, 1e-3)))
     median = np.nanmedian(np.concatenate([size.ravel() for size in sizes]))
     return [np.nan_to_num(size / median, nan=1.0) for size in sizes]
@@ -60,9 +63,12 @@ def surface_tangents(depth: NDArray, direction: NDArray, normal: NDArray) -> NDA
     across = np.einsum("hwi,hwi->hw", normal, direction)
     out = np.empty((*depth.shape, 2, 3), np.float32)
     for axis in range(2):
+        # Directions of a pinhole camera are affine in the pixel, so these differences are exact: (H, W, 3) for one pixel.
         change = np.gradient(direction, axis=1 - axis)
+        # Moving along the ray by this much brings the displaced point back into the plane of the face.
         slide = np.einsum("hwi,hwi->hw", normal, change) / np.where(across == 0, 1e-12, across)
         moved = change - direction * slide[..., None]
+        # Edge-on, `slide` has no bound, and the displacement would leave the face.
         length, limit = np.linalg.norm(moved, axis=-1), MAX_STEP * np.linalg.norm(change, axis=-1)
         moved *= np.minimum(1, limit / np.maximum(length, 1e-20))[..., None]
         out[..., axis, :] = np.where(depth > 0, depth, 0)[..., None] * moved

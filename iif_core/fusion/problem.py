@@ -113,8 +113,8 @@ class FusionResult:
         margin: (S, 3) float32 how clear the selection is, 0 = a tie, 1 = one prediction fits exactly.
         effective: (S, 3) float32 effective number of predictions of the segment, 1 ... K (Eq. F.49).
         affine_albedo: (S, K, 3, 4); affine_roughness, affine_metallic: (S, K, 2) = (gain, bias); float32.
-        error: (S, K, 3) float32 mean squared error of each corrected prediction against the texture before the last
-            update.
+        error: (S, K, 3) float32 mean squared error of each corrected prediction against the texture, which is the one
+            before the last update for least squares and the final one otherwise.
         dropped: predictions that were not used.
         history: one entry per sweep: temperature, error of each property, entropy, gain, change.
     """
@@ -145,6 +145,7 @@ def one_segment_per_view(problem: FusionProblem) -> FusionProblem:
     segments = [
         np.where(np.asarray(segment) >= 0, view, -1).astype(np.int32) for view, segment in enumerate(problem.segment_of_pixel)
     ]
+    # A whole photograph belongs to no single object, hence -1.
     return replace(problem, segment_of_pixel=segments, object_of_segment=np.full(len(segments), -1, np.int32))
 
 
@@ -184,6 +185,7 @@ def prediction_faults(
     spread = np.zeros(len(maps))
     for k, prediction in enumerate(maps):
         some = slice(None, None, max(1, len(prediction) // 4096))  # enough to tell a picture from a constant
+        # Only a prediction that looks constant in the sample is read whole.
         for part in (some, slice(None)):
             good = prediction[part, :3][finite[k, part]].astype(np.float32)
             spread[k] = good.std(0).max() if len(good) else 0.0
@@ -237,15 +239,17 @@ def usable_pixels(problem: FusionProblem, view: int, maps: NDArray | None = None
     weight = np.ones(len(cell)) if problem.weight is None else np.ravel(problem.weight[view]).astype(np.float64)
     good = np.stack([np.isfinite(prediction).all(-1) for prediction in maps]) if finite is None else finite
     keep = (cell >= 0) & (segment >= 0) & (weight.astype(np.float32) > 0)  # the kernels' precision
+    # Values that are not finite count against a prediction only at the pixels that are kept.
     faults = prediction_faults(maps, good, keep)
     usable = np.array([not fault for fault in faults])
     dropped = [Dropped(view, k, fault) for k, fault in enumerate(faults) if fault]
+    # All usable predictions of a segment are compared over the same pixels, so one bad value excludes the pixel.
     finite = good[usable].all(0)
     lost = int((keep & ~finite).sum())
     if lost and usable.any():
         dropped.append(Dropped(view, -1, f"{lost} pixels are not finite in some prediction and were left out"))
     pixel = np.flatnonzero(keep & finite) if usable.any() else np.zeros(0, np.intp)
-    pixel = pixel[np.argsort(segment[pixel], kind="stable")]
+    pixel = pixel[np.argsort(segment[pixel], kind="stable")]  # stable: picture order within a segment
     return UsablePixels(pixel, cell[pixel], segment[pixel], weight[pixel], usable, dropped)
 
 

@@ -23,12 +23,13 @@ def cell_scales(run: FusionPass, texture: NDArray) -> tuple[NDArray, NDArray]:
         target = kernels.texture_at(texture, block.cell)
         mixed, b_ref, votes_of = reference_distribution(run, block, target)
         if block.scale.size:  # predictions that agree may be wrong together
+            # `fmax` ignores NaN: where the prior states no number, the disagreement alone counts (Eq. F.62).
             b_ref = np.fmax(b_ref, block.scale[[0, 0, 0, 1, 2]])
         return block, laplace.scale_contribution(mixed - target, b_ref, floor), votes_of
 
     cells = CellSums(run.problem.n_cells)
     for block, part, votes_of in run.map_views(one_view):
-        votes[block.segments] = votes_of
+        votes[block.segments] = votes_of  # a segment lies in one view
         cells.add(block.cell, part, block.weight)
     return laplace.floored(cells.mean(np.zeros(5)), np.float32(floor)), votes
 
@@ -41,6 +42,7 @@ def reference_distribution(run: FusionPass, block: Block, target: NDArray) -> tu
     """
     rows, state = block.segments, run.state
     affine = state.affine[rows].astype(np.float32)
+    # Maps for the single predictions, and maps times weights for their mixture; both in the CROSS layout.
     blend = (state.affine[rows] * state.alpha[rows][..., PROPERTY_OF_ENTRY]).astype(np.float32)
     mixed = kernels.mixture(block.values, blend, block.start, LOWEST)
     network = kernels.sorting_network(int(block.usable.sum()))

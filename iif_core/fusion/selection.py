@@ -19,17 +19,21 @@ def selection_weights(error: NDArray, temperature: float, usable: NDArray | None
     """
     error = np.asarray(error, np.float64)
     usable = np.ones(error.shape, bool) if usable is None else np.broadcast_to(usable, error.shape)
+    # Infinity puts unusable predictions last in every order below.
     counted = np.where(usable, error, np.inf)
     lowest = counted.min(-1, keepdims=True)
     any_usable = np.isfinite(lowest)
+    # With the smallest error subtracted, the best prediction has exp(0) = 1, and the sum cannot underflow at any temperature
+    # (docs/method/numerics.md#cold-temperatures).
     excess = np.where(usable, error, 0.0) - np.where(any_usable, lowest, 0.0)
     ranked = np.sort(counted, -1)
-    middle = np.maximum(usable.sum(-1, keepdims=True) - 1, 0) // 2
+    middle = np.maximum(usable.sum(-1, keepdims=True) - 1, 0) // 2  # rank of the lower median among the usable ones
     median = np.where(any_usable, np.take_along_axis(ranked, middle, -1), 0.0)
     if temperature > 0:
-        weight = np.exp(-excess / (temperature * (median + 1e-6)))
+        weight = np.exp(-excess / (temperature * (median + 1e-6)))  # 1e-6: all errors may be 0
     else:
         weight = (excess <= 1e-9 * median + 1e-12).astype(np.float64)
+    # An unusable prediction has the excess 0 - lowest <= 0, and would get the largest weight.
     weight = np.where(usable, weight, 0.0)
     total = weight.sum(-1, keepdims=True)
     return weight / np.where(total > 0, total, 1.0)
@@ -48,6 +52,7 @@ def margin(error: NDArray, usable: NDArray) -> NDArray:
     best, second = two[..., 0], two[..., 1]
     known = np.isfinite(second) & (second > 0)
     ratio = 1 - np.where(known, best, 0) / np.where(known, second, 1)
+    # Otherwise the second error is infinite (one prediction is usable: 1), or 0 (a tie of exact fits: 0).
     return np.where(known, ratio, (np.isfinite(best) & ~np.isfinite(second)).astype(np.float64))
 
 

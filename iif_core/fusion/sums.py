@@ -58,16 +58,22 @@ class SegmentSums:
             raise InputError(f"segment {segment} has pixels in two views; a segment is one object in one view")
         weight = self.fit_weight(block)
         gram = kernels.gram(block.values, weight, block.start, NO_MASK)
+        # The summed weight is the same for all predictions: one that is unusable has values 0, but its pixels keep their weight.
         self.gram[rows], self.weight[rows], self.usable[rows] = gram, gram[:, 0, 13], block.usable
         fit = gram
         if block.inside.size:
             count = np.diff(block.start)
+            # Pixels (s, K) that are not clipped. Every segment of a block has a pixel; `reduceat` would return a single element
+            # for an empty one.
             remain = np.add.reduceat(block.inside, block.start[:-1], axis=1, dtype=np.int64).T
             enough = (remain >= options.clip_pixels) & (remain >= (1 - options.clip_share) * count[:, None])
             self.masked[rows] = block.usable & enough & (remain < count[:, None])
             fit = np.where(self.masked[rows][..., None], kernels.gram(block.values, weight, block.start, block.inside), gram)
         few = np.maximum(1, options.ridge_pixels / np.diff(block.start))  # Eq. F.26
         self.ridge[rows] = options.ridge * self.weight[rows] * few
+        # The sweeps change the right-hand side alone, so the inverse is formed once and a sweep multiplies (Eq. F.25). Values lie
+        # in [0, 1]: the eigenvalues of G are at most 4 W, the ridge adds at least rho W, and the condition number is at most 1 +
+        # 4/rho.
         for out, where, source in zip(self.inverse, (_GRAM_4, _GRAM_R, _GRAM_M), (fit, gram, gram), strict=True):
             out[rows] = np.linalg.inv(source[..., where] + self.ridge[rows, None, None, None] * np.eye(len(where)))
 
@@ -78,7 +84,7 @@ class SegmentSums:
         """
         ridge = self.ridge[rows, None, None]
         out = np.empty(cross.shape)
-        right = cross_albedo[..., :12] + ridge * IDENTITY[:12]
+        right = cross_albedo[..., :12] + ridge * IDENTITY[:12]  # c + lambda T_id, times the symmetric inverse
         out[..., :12] = (right.reshape(*right.shape[:2], 3, 4) @ self.inverse[0][rows]).reshape(*right.shape)
         for part, inverse in ((slice(12, 14), self.inverse[1]), (slice(14, 16), self.inverse[2])):
             right = cross[..., part] + ridge * IDENTITY[part]
@@ -94,12 +100,13 @@ class SegmentSums:
         Returns:
             (s, K, 3) float64.
         """
-        gram, weight = self.gram[rows], self.weight[rows, None]
+        gram, weight = self.gram[rows], self.weight[rows, None]  # over all pixels, whatever the map was fitted to
         out = np.zeros((*affine.shape[:2], 3))
         for p, part, where in ((0, slice(0, 12), _GRAM_4), (1, slice(12, 14), _GRAM_R), (2, slice(14, 16), _GRAM_M)):
             channels = 3 if p == 0 else 1
             t = affine[..., part].reshape(*affine.shape[:2], channels, len(where))
             c = cross[..., part].reshape(t.shape)
+            # sum_c T_c G T_c' - 2 T_c c_c', (s, K). A difference of large sums: rounding can leave a tiny negative error.
             total = (t @ gram[..., where] * t).sum((-1, -2)) - 2 * (t * c).sum((-1, -2))
             total += square[:, :3].sum(1)[:, None] if p == 0 else square[:, p + 2][:, None]
             out[..., p] = np.maximum(total / (channels * weight), 0)
@@ -140,7 +147,7 @@ def sweep_summary(sums: SegmentSums, state: SegmentState) -> dict[str, float]:
     """
     total = max(sums.weight.sum(), 1e-30)
     mixed = (sums.weight[:, None] * (state.alpha * state.error).sum(1)).sum(0) / total
-    log = np.log(np.where(state.alpha > 0, state.alpha, 1.0))
+    log = np.log(np.where(state.alpha > 0, state.alpha, 1.0))  # 0 log 0 = 0
     entropy = -(sums.weight * (state.alpha * log).sum(1).mean(1)).sum() / total
     gains = (state.alpha[..., 0] * state.affine[..., [0, 5, 10]].mean(-1)).sum(1)
     gain = (sums.weight * gains).sum() / total

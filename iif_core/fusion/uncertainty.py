@@ -47,6 +47,7 @@ class Calibration:
 
 
 def _features(b: NDArray, viewpoints: NDArray, pixels: NDArray, predictions: NDArray | int) -> NDArray:
+    # The power law is linear in logarithms: log b, -log V, -log K and -log P with the exponents g, h, q and p.
     views = np.maximum(viewpoints, 1.0)
     parts = (np.log(np.asarray(b, np.float64)), -np.log(views), -np.log(predictions), -np.log(np.maximum(pixels / views, 1)))
     return np.stack(np.broadcast_arrays(*parts), -1)
@@ -112,7 +113,9 @@ def gauge_free_error(value: NDArray, truth: NDArray, object_id: NDArray, ridge: 
     order = np.argsort(object_id, kind="stable")
     cuts = np.flatnonzero(np.diff(object_id[order])) + 1
     for rows in np.split(order, cuts) if len(order) else []:
+        # Centring removes the shift delta; what is left is one ridge regression of the values on the truth.
         y, x = value[rows] - value[rows].mean(0), truth[rows] - truth[rows].mean(0)
+        # `slope` is B transposed. The ridge keeps the matrix of an object of one colour regular.
         slope = np.linalg.solve(x.T @ x + ridge * len(rows) * np.eye(x.shape[1]), x.T @ y)
         out[rows] = y - x @ slope
     return out

@@ -43,6 +43,7 @@ def texel_of(xp: Namespace, direction: tuple[Any, Any, Any], height: int, width:
     theta = xp.acos(xp.minimum(xp.maximum(z, -1.0), 1.0))
     phi = xp.atan2(y, x)
     phi = xp.where(phi < 0, phi + 2 * xp.pi, phi)
+    # The limits catch theta = pi and an azimuth that rounding brings to 2 pi.
     row = xp.minimum(xp.floor(theta * (height / xp.pi)), height - 1.0)
     return row, xp.minimum(xp.floor(phi * (width / (2 * xp.pi))), width - 1.0)
 
@@ -66,6 +67,7 @@ def direction_in(xp: Namespace, row: Any, column: Any, u1: Any, u2: Any, height:
         near, far = xp.sin(first * half), xp.sin(last * half)
         return 2 * ((1 - u1) * near * near + u1 * far * far)
 
+    # sin^2 of the polar angle is (1 - z)(1 + z), a product without cancellation at either pole.
     above, below = between(row, row + 1), between(height - row, height - row - 1)  # 1 - z and 1 + z
     phi = (column + u2) * (2 * xp.pi / width)
     sine = xp.sqrt(above * below)

@@ -88,7 +88,8 @@ class SurfaceCellsBuilder:
             raise InputError(f"surface cells of edge {edge}; a length in metres above 0 is needed")
         self.edge, self.origin = float(edge), grid_origin(corners, edge)
         self.keys, self.group = np.zeros(0, np.uint64), np.zeros(0, np.int64)
-        self.sums = np.zeros((0, 14))  # pixels, saturated, unsaturated, point, normal, log L of unsaturated (3 each), ...
+        # Columns: pixels, saturated pixels; then, 3 each: point, normal, log L of unsaturated pixels, L of all pixels.
+        self.sums = np.zeros((0, 14))
 
     def add(
         self, points: NDArray, normals: NDArray, group: NDArray, radiance: NDArray, saturated: NDArray, exposure: float
@@ -110,6 +111,7 @@ class SurfaceCellsBuilder:
         rows = np.concatenate([ones, ~clear[:, None], points, normals, log, radiance], 1)
         self._merge(np.r_[self.keys, keys], np.r_[self.group, group], np.concatenate([self.sums, rows]))
         while len(self.keys) > MAX_CELLS:
+            # Voxels of twice the edge have half the index; group and side stay apart.
             ijk, object_id = unpack_keys(self.keys)
             self.edge *= 2
             self._merge(pack_keys(ijk >> 1, object_id), self.group, self.sums)
@@ -123,6 +125,7 @@ class SurfaceCellsBuilder:
         """Return the cells with means over their pixels."""
         count, shone, clear = self.sums[:, 0], self.sums[:, 1], self.sums[:, 0] - self.sums[:, 1]
         ijk, _ = unpack_keys(self.keys)
+        # Rays meet voxels: their radiance is the mean over all groups and sides in them.
         voxel_key, voxel = np.unique(pack_keys(ijk, np.full(len(ijk), -1)), return_inverse=True)
         voxel = voxel.ravel()
         of_voxel = _sums(voxel, len(voxel_key), self.sums[:, [0, 11, 12, 13]])
@@ -167,6 +170,8 @@ def gather(cells: SurfaceCells, trace: Trace, seed: int = 0, rays: int | None = 
     Returns:
         Known light and shares of the unknown sources: lamps, sky patches, unseen surface.
     """
+    # -------- unknown sources: lamps, patches of sky, unseen surface --------
+    # `shines` marks voxels of lamps, which the rays below pass over because lamps have form factors.
     rng, rays = np.random.default_rng(seed), rays or RAYS
     lamp_of_cell, guess, spread = _lamps(cells)
     lamps = len(guess)
@@ -174,12 +179,18 @@ def gather(cells: SurfaceCells, trace: Trace, seed: int = 0, rays: int | None = 
     shines[cells.voxel[lamp_of_cell >= 0]] = True
     sky = sphere_points(SKY_PATCHES)
     known, share = np.zeros((len(cells), 3)), np.zeros((len(cells), lamps + SKY_PATCHES + 1))
+
+    # -------- what cosine-distributed rays meet --------
+    # Origins lie off the surface; `turn` shifts the pattern at random, a cell by itself, so that neighbours do not share its
+    # gaps.
     tangents = _tangents(cells.normals)
     start = cells.points + 0.02 * cells.edge * cells.normals
     turn = rng.random((len(cells), 2))
     for first in range(0, rays, RAYS_AT_ONCE):
         ways = []
         for i in range(first, min(first + RAYS_AT_ONCE, rays)):
+            # Strata in the radius, golden ratio in the angle: the points of one cell fill the disc evenly. Lifted to the
+            # hemisphere, a uniform disc has density cos / pi.
             u = (np.array([(i + 0.5) / rays, (0.6180339887 * i) % 1]) + turn) % 1
             radius, angle = np.sqrt(u[:, :1]), 2 * np.pi * u[:, 1:]
             ways.append(
@@ -187,6 +198,7 @@ def gather(cells: SurfaceCells, trace: Trace, seed: int = 0, rays: int | None = 
             )
         for way, (face, t) in zip(ways, _traced(trace, [start] * len(ways), ways), strict=True):
             hit = np.flatnonzero(face >= 0)
+            # Photographed surface is known, other surface is the last source, and a miss is a patch of sky.
             row = find_voxel(cells, start[hit] + t[hit, None] * way[hit])
             seen = row >= 0
             plain = seen & ~shines[row]  # lamps have rays of their own
@@ -194,10 +206,13 @@ def gather(cells: SurfaceCells, trace: Trace, seed: int = 0, rays: int | None = 
             share[hit[~seen], -1] += 1
             out = np.flatnonzero(face < 0)
             share[out, lamps + (way[out] @ sky.T).argmax(1)] += 1
+
+    # -------- shares of the hemisphere, and form factors of lamps --------
     known /= rays
     share /= rays
     for j in range(lamps):
         share[:, j] = _form_factor(cells, np.flatnonzero(lamp_of_cell == j), start, trace, rng)
+    # First guess of sky and unseen surface: the mean of the photographs.
     ambient = np.log(np.maximum(np.average(np.exp(cells.log_radiance), axis=0, weights=np.maximum(cells.pixels, 1e-9)), 1e-6))
     return Gathered(
         known,
@@ -228,10 +243,12 @@ def _lamps(cells: SurfaceCells) -> tuple[NDArray, NDArray, NDArray]:
         return lamp, np.zeros((0, 3)), np.zeros(0)
     pairs = cKDTree(cells.points[own]).query_pairs(2 * cells.edge, output_type="ndarray")
     label = component_labels(len(own), *pairs.T)
+    # Largest lamps first.
     rank = np.argsort(np.argsort(-np.bincount(label), kind="stable"), kind="stable")
     lamp[own] = np.minimum(rank[label], MAX_LAMPS - 1)  # all small lamps are one
     count = int(lamp.max()) + 1
     size = np.maximum(np.bincount(lamp[own], minlength=count), 1)
+    # What the photographs show of a lamp; where it is clipped, only a bound, hence the higher guess and the wider prior.
     radiance = _sums(lamp[own], count, cells.voxel_radiance[cells.voxel[own]]) / size[:, None]
     clipped = np.bincount(lamp[own], cells.saturated[own], count) / size > 0.25
     guess = np.log(np.maximum(radiance, 1e-6)) + np.where(clipped, np.log(LAMP_ABOVE), 0.0)[:, None]
@@ -243,17 +260,20 @@ def _form_factor(cells: SurfaceCells, lamp: NDArray, start: NDArray, trace: Trac
     total, n = np.zeros(len(cells)), len(cells)
     lit, ways, terms = [], [], []
     for _ in range(SHADOW_RAYS):
+        # One random cell of the lamp for each receiver, and a random point in the plane of that cell.
         own = lamp[rng.integers(0, len(lamp), n)]
         jitter = (rng.random((n, 3)) - 0.5) * 0.5 * cells.edge * (1 - np.abs(cells.normals[own]))
         way = cells.points[own] + jitter - start
         square = np.maximum((way**2).sum(1), 1e-12)
         here, there = (way * cells.normals).sum(1), -(way * cells.normals[own]).sum(1)
         facing = np.flatnonzero((here > 0) & (there > 0))
+        # r^2 cos cos' / r^4, because `way` has length r. The floor of half an edge keeps neighbours of a lamp finite (Eq. L.56).
         term = here * there / np.maximum(square, (0.5 * cells.edge) ** 2) ** 2
         lit.append(facing)
         ways.append(way[facing])
         terms.append((term[facing], 1 - 0.5 * cells.edge / np.sqrt(square[facing])))
     for cell, (term, nearest), (_, t) in zip(lit, terms, _traced(trace, [start[cell] for cell in lit], ways), strict=True):
+        # Visible if the ray gets within half an edge of the point, in lengths of `way`.
         near = t > nearest
         total[cell[near]] += term[near]
     return np.minimum(total / SHADOW_RAYS * len(lamp) * cells.edge**2 / np.pi, 1.0)
@@ -277,11 +297,14 @@ def fit_light(
     group = group.ravel()
     groups = int(group.max(initial=-1)) + 1
     use = cells.pixels >= 2
+    # A group of N cells counts as sqrt(N), so that large walls do not decide alone.
     weight0 = use / np.sqrt(np.maximum(np.bincount(group[use], minlength=groups)[group], 1))
     prior_weight = WIDTH**2 / spread**2  # precision of the albedo's prior, in units of a cell's
     log_prior = np.log(np.broadcast_to(albedo, (groups, 3)))
     light, log_albedo = np.zeros((len(cells), 3)), np.zeros((len(cells), 3))
+    # m_0 of Eq. L.55, so that the logarithm exists where a cell sees nothing.
     floor = 1e-3 * float(np.exp(gathered.start).mean()) if gathered.start.size else 1e-6
+    # Sources that no cell sees leave the system.
     active = gathered.share.max(0, initial=0) > 2e-3
     share = gathered.share[:, active]
     for c in range(3):
@@ -289,13 +312,18 @@ def fit_light(
         precision = WIDTH**2 / gathered.spread[active] ** 2
         weight = weight0
         for _ in range(SWEEPS):
+            # -------- levels of the groups under the present sources --------
             source = np.exp(theta)
             mean = gathered.known[:, c] + share @ source + floor
             difference = cells.log_radiance[:, c] - np.log(mean)
             total = np.bincount(group, weight, groups) + prior_weight
             level = (np.bincount(group, weight * difference, groups) + prior_weight * log_prior[:, c]) / total
+
+            # -------- Cauchy weights --------
             residual = difference - level[group]
             weight = weight0 / (1 + (residual / WIDTH) ** 2)
+
+            # -------- Gauss-Newton step in theta, at most 1 in each --------
             slope = share * source / mean[:, None]
             # The level of a group follows theta: subtract the group's mean of every column.
             total = np.bincount(group, weight, groups) + prior_weight
@@ -320,6 +348,7 @@ def residual_light(cells: SurfaceCells, residual: NDArray, reach: float) -> NDAr
 
     low = cells.origin - reach
     side = dominant_side(cells.normals)
+    # Robust mean in each box: texture is an outlier, slow light is not.
     keys = pack_keys(voxel_indices(cells.points, reach / 2, low), ((cells.group + 1) % _GROUPS) * 6 + side)
     _, box = np.unique(keys, return_inverse=True)
     box = box.ravel()
@@ -332,12 +361,14 @@ def residual_light(cells: SurfaceCells, residual: NDArray, reach: float) -> NDAr
         mean = _sums(box, boxes, weight[:, None] * residual) / np.maximum(count, 1e-12)[:, None]
         weight = start / (1 + (np.abs(residual - mean[box]).mean(1) / WIDTH) ** 2)
     _, group = np.unique(cells.group, return_inverse=True)
+    # A unit of distance is one reach, or a change of 1 in the normal. Other groups lie out of reach.
     place = np.concatenate([cells.points / reach, cells.normals, 1e3 * group.reshape(-1, 1)], 1)
     centre = _sums(box, boxes, place) / np.bincount(box, minlength=boxes)[:, None]
     distance, near = cKDTree(centre).query(place, k=min(32, boxes), distance_upper_bound=3.0)
     distance, near = distance.reshape(len(place), -1), near.reshape(len(place), -1)
     found = np.isfinite(distance)
     near = np.where(found, near, 0)
+    # `query` pads with infinite distances where fewer boxes are near.
     kernel = np.where(found, np.exp(-0.5 * np.where(found, distance, 0) ** 2), 0) * count[near]
     smooth = (kernel[..., None] * mean[near]).sum(1) / np.maximum(kernel.sum(1), 1e-9)[:, None]
     luminance = smooth.mean(1, keepdims=True)
@@ -376,6 +407,7 @@ def find_voxel(cells: SurfaceCells, points: NDArray) -> NDArray:
     if not len(points) or not len(cells.voxel_key):
         return np.full(len(points), -1)
     ijk = np.floor((points - cells.origin) / cells.edge)
+    # `pack_keys` refuses indices outside its range; such points ask for the last voxel of the range instead.
     ijk = np.where(((ijk >= 0) & (ijk < _OUTSIDE)).all(1)[:, None], ijk, _OUTSIDE).astype(np.int64)
     keys = pack_keys(ijk, np.full(len(ijk), -1))
     row = np.minimum(np.searchsorted(cells.voxel_key, keys), len(cells.voxel_key) - 1)

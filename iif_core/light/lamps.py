@@ -103,5 +103,6 @@ def _points(vertices: Array, faces: Array) -> Array:
     share = areas / areas.sum() if areas.sum() > 0 else np.full(len(faces), 1 / len(faces))
     chosen = rng.choice(len(faces), POINTS, p=share)
     root, second = np.sqrt(rng.random(POINTS)), rng.random(POINTS)
+    # Barycentric coordinates with a square root are uniform over a triangle.
     weights = np.stack([1 - root, root * (1 - second), root * second], 1)
     return np.concatenate([np.einsum("ij,ijk->ik", weights, vertices[faces[chosen]]), vertices[faces].mean(1)])

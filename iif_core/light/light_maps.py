@@ -76,10 +76,12 @@ def smooth(points: ArrayLike, normals: ArrayLike, light: Array, reach: float) ->
 
     if not len(light):
         return np.zeros(light.shape, np.float32)
+    # One space for position and normal, in which distance 1 is one standard deviation of Eq. L.60.
     place = np.concatenate([np.asarray(points, np.float64) / reach, np.asarray(normals, np.float64) / NORMAL_REACH], 1)
     count = min(NEIGHBOURS, len(place))
     distance, near = (found.reshape(len(place), count) for found in cKDTree(place).query(place, k=count))
     level = light.sum((1, 2), dtype=np.float64)
+    # Relative to the mean of both texels. Where both are dark the light is equal, and the tiny divisor decides nothing.
     width = CONTRAST * (level[near] + level[:, None]) / 2
     apart = (level[near] - level[:, None]) / np.maximum(width, 1e-300)
     weight = np.exp(-0.5 * (distance**2 + apart**2))
@@ -113,6 +115,7 @@ def with_mean_of(traced: Array, denoised: Array, part: ArrayLike, area: ArrayLik
     for lamp in range(traced.shape[1]):
         sums = [np.bincount(part, area * maps[:, lamp].sum(1, dtype=np.float64)) for maps in (traced, denoised)]
         whole = sums[0].sum() / sums[1].sum() if sums[1].sum() > 0 else 1.0
+        # A part without denoised light has the ratio of all parts.
         own = np.divide(sums[0], sums[1], out=np.full(len(count), whole), where=sums[1] > 0)
         gain = np.clip((count * own + TEXELS_TRUSTED * whole) / (count + TEXELS_TRUSTED), *GAIN_LIMITS)
         out[:, lamp] = denoised[:, lamp] * gain[part, None]
@@ -139,6 +142,7 @@ def to_half(maps: ArrayLike) -> Halves:
     if not np.isfinite(maps).all() or maps.min(initial=0) < 0:
         raise InputError("light maps contain negative or non-finite light; please report it with the scene")
     top = maps.max(axis=(0, 2), initial=0)
+    # A power of two changes the exponent alone, so the digits of a half float are kept.
     scale = np.where(top > 0, np.exp2(np.ceil(np.log2(np.where(top > 0, top, 1.0))) - np.log2(HALF_TOP)), 1.0)
     return Halves((maps / scale[:, None]).astype(np.float16), scale)
 

@@ -65,6 +65,7 @@ def sphere_mesh(centre: ArrayLike, radius: float, subdivisions: int = 3) -> tupl
     vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
     corner = vertices[faces]
     cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    # The centre is the origin, so an outward normal points the same way as a corner.
     inward = np.einsum("ij,ij->i", cross, corner[:, 0]) < 0
     faces[inward] = faces[inward][:, ::-1]
     scale = radius * np.sqrt(4 * np.pi / (0.5 * np.linalg.norm(cross, axis=1).sum()))
@@ -74,6 +75,7 @@ def sphere_mesh(centre: ArrayLike, radius: float, subdivisions: int = 3) -> tupl
 def _split(vertices: Array, faces: Array) -> tuple[Array, Array]:
     """Split every triangle into four at the middles of its edges."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
+    # Two faces share an edge and thereby its middle.
     unique, index = np.unique(edges, axis=0, return_inverse=True)
     ab, bc, ca = np.split(index.ravel() + len(vertices), 3)
     a, b, c = faces.T

@@ -41,7 +41,9 @@ def filtered_normals(normal: ArrayLike, area: ArrayLike, pairs: ArrayLike, round
     normal, area, pairs = np.asarray(normal, np.float64), np.asarray(area, np.float64), np.asarray(pairs)
     a, b = pairs[:, 0], pairs[:, 1]
     for _ in range(rounds):
+        # (e,) likeness of the two normals of a pair, small across a crease (Eq. O.4).
         near = np.exp(-((normal[a] - normal[b]) ** 2).sum(1) / (2 * FILTER_WIDTH**2))
+        # A face without a normal adds 0 and takes the mean of its neighbours.
         total = normal * area[:, None]
         for c in range(3):
             total[:, c] += np.bincount(a, near * area[b] * normal[b, c], len(normal))
@@ -77,7 +79,7 @@ def edge_weights(
     known = normal.any(1)
     bend = np.where(known[a] & known[b], 1 - np.clip((normal[a] * normal[b]).sum(1), -1, 1), 0)
     convex = (normal[b] * (centre[b] - centre[a])).sum(1) > 0
-    weight = np.where(convex, np.minimum(bend, bend * bend), bend)
+    weight = np.where(convex, np.minimum(bend, bend * bend), bend)  # beyond 90 degrees the square would be the larger one
     if colour is not None and colour_weight > 0:
         colour = np.asarray(colour, np.float64)
         weight = weight + colour_weight * np.nan_to_num(np.abs(colour[a] - colour[b]).max(1), nan=0.0)
@@ -101,8 +103,10 @@ def smooth_over_faces(values: ArrayLike, weight: ArrayLike, pairs: ArrayLike, ro
     values, weight, pairs = np.asarray(values, np.float64), np.asarray(weight, np.float64), np.asarray(pairs)
     count = len(values)
     ends = np.concatenate([pairs, pairs[:, ::-1]])
+    # Row f of the matrix sums face f and its neighbours.
     graph = (coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (count, count)) + identity(count)).tocsr()
     total = np.where(weight[:, None] > 0, values, 0) * weight[:, None]
+    # Weighted sums and weights spread alike; the one division at the end keeps every value weighted by its pixels.
     for _ in range(rounds):
         total, weight = graph @ total, graph @ weight
     return np.where(weight[:, None] > 0, total / np.where(weight > 0, weight, 1)[:, None], np.nan)
@@ -143,12 +147,14 @@ def merge_regions(
 def _merged(count, first, second, weight, scale, min_size, fill):
     """Find the root of every node: union-find with path halving over the sorted edges, and a second pass for small regions.
     `fill` is overwritten."""
+    # limit = Int(C) + k / |C| at the root of each region C; a single node has no inner edge, so Int is 0.
     parent, size, limit = np.arange(count), np.ones(count, np.int64), np.full(count, scale)
+    # -------- first pass: Eq. O.6; second pass: small regions join across their lightest edge --------
     for last in (False, True):
         for edge in range(len(first)):
             a, b = first[edge], second[edge]
             while parent[a] != a:
-                parent[a] = parent[parent[a]]
+                parent[a] = parent[parent[a]]  # path halving keeps trees flat
                 a = parent[a]
             while parent[b] != b:
                 parent[b] = parent[parent[b]]
@@ -160,13 +166,13 @@ def _merged(count, first, second, weight, scale, min_size, fill):
                     continue
             elif weight[edge] > limit[a] or weight[edge] > limit[b]:
                 continue
-            if size[a] < size[b]:
+            if size[a] < size[b]:  # the smaller tree hangs below the larger
                 a, b = b, a
             parent[b] = a
             size[a] += size[b]
             fill[a] += fill[b]
             if not last:
-                limit[a] = weight[edge] + scale / size[a]
+                limit[a] = weight[edge] + scale / size[a]  # edges come in order: this one is the heaviest inside
     for node in range(count):
         root = node
         while parent[root] != root:
@@ -208,6 +214,7 @@ def segment_mesh(
     normal, area = face_geometry(vertices, faces)
     normal = filtered_normals(normal, area, pairs)
     weights = edge_weights(normal, vertices.astype(np.float64)[faces].mean(1), pairs, colour, colour_weight)
+    # Infinite `min_area` gives 0, so the number of faces alone counts; with 0 a single face fills a region.
     fill = area / max(min_area, 1e-300)
     labels = merge_regions(len(faces), pairs, weights, scale, min_faces, fill)
     return _join_islands(vertices, faces, labels, (np.bincount(labels) < min_faces) & (np.bincount(labels, fill) < 1.0))
@@ -223,6 +230,7 @@ def _join_islands(vertices: Array, faces: Array, labels: Array, is_small: Array)
     corners = np.asarray(vertices, np.float64)[faces]
     centre = corners.mean(1)
     edge = float(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1).mean())
+    # What is small after both passes has no edge to anything else, so only distance can find it a region.
     large = np.flatnonzero(~small)
     island = np.flatnonzero(small)
     distance, nearest = cKDTree(centre[large]).query(centre[island])
@@ -230,7 +238,7 @@ def _join_islands(vertices: Array, faces: Array, labels: Array, is_small: Array)
     order = np.lexsort((island, distance, labels[island]))
     pieces, first = np.unique(labels[island][order], return_index=True)
     chosen = order[first]
-    target = np.where(distance[chosen] <= ISLAND_GAP * edge, labels[large[nearest[chosen]]], pieces)
+    target = np.where(distance[chosen] <= ISLAND_GAP * edge, labels[large[nearest[chosen]]], pieces)  # else it keeps its label
     out = labels.copy()
     out[island] = target[np.searchsorted(pieces, labels[island])]
     return numbered_by_first(out)

@@ -101,7 +101,7 @@ def masks_at(
     height, width = depth.shape
     u, v, z = project(points, *camera, pose)
     row = np.flatnonzero((z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height))
-    i, j = v[row].astype(np.int64), u[row].astype(np.int64)
+    i, j = v[row].astype(np.int64), u[row].astype(np.int64)  # pixel i covers [i, i + 1)
     there = depth[i, j]
     seen = (there > 0) & (np.abs(there - z[row]) <= slack + 0.02 * z[row])
     return row[seen], labels[i[seen], j[seen]].astype(np.int32)
@@ -133,7 +133,7 @@ def gather_masks(seen: Sequence[tuple[Array, Array]], count: int, min_points: in
         visible.append(csr_matrix((np.ones(len(point), np.float32), point, [0, len(point)]), (1, count)))
         kept = label > 0
         ids, which, size = np.unique(label[kept], return_inverse=True, return_counts=True)
-        large = size >= min_points
+        large = size >= min_points  # masks of enough points; `rank` is their row in this view
         rank = np.cumsum(large) - 1
         used = large[which]
         at = (rank[which[used]], point[kept][used])
@@ -162,18 +162,21 @@ def containment(masks: MaskPoints, options: ConsensusOptions) -> Containment:
     container, split = np.full((count, views), -1, np.int32), np.zeros((count, views), bool)
     for rows in _blocks(count):
         block = masks.in_mask[rows]
+        # -------- |M| (n,), |S_f(M)| (n, F), shared points of every two masks (n, M) and |L_f(M)| (n, F) --------
         size = np.asarray(block.sum(1)).ravel()
         seen = np.asarray((block @ masks.visible.T).todense())
         shared = (block @ masks.in_mask.T).tocsr()
         shared.sort_indices()
         row = np.repeat(np.arange(shared.shape[0]), np.diff(shared.indptr))
         view = masks.view[shared.indices]
+        # Masks of one view have no point in common, so their shares of M add up. A view without any of them has no entry below.
         masked = np.zeros(seen.shape)
         np.add.at(masked, (row, view), shared.data)
         # The largest overlap of every (row, view), the lowest mask among equals: last after this sort.
         order = np.lexsort((-shared.indices, shared.data, view, row))
         last = np.flatnonzero(np.r_[np.diff(row[order] * views + view[order]) > 0, len(order) > 0])
         best = order[last]
+        # -------- which views can judge, contain or split (Eq. O.8, O.9) --------
         r, f = row[best], view[best]
         visible = (seen[r, f] >= options.visible * size[r]) | (seen[r, f] >= SUFFICIENT_POINTS)
         judged = visible & (masked[r, f] >= MASKED_SHARE * seen[r, f])
@@ -214,7 +217,7 @@ def cluster_masks(masks: MaskPoints, options: ConsensusOptions | None = None) ->
     container = np.where((votes.container >= 0) & ~dropped[votes.container], votes.container, -1)
     kept = np.flatnonzero(~dropped)
     if len(kept):
-        labels[kept] = _join(container[kept], count, options.consensus)
+        labels[kept] = _join(container[kept], count, options.consensus)  # `container` keeps the numbers of all masks
     return labels
 
 
@@ -223,19 +226,22 @@ def _join(container: Array, count: int, consensus: float) -> Array:
     from scipy.sparse import csr_matrix
 
     n = len(container)
+    # V_i as bits, and C_i as rows of a sparse matrix over all masks.
     views = packed_flags(container >= 0)
     row, view = np.nonzero(container >= 0)
     holders = csr_matrix((np.ones(len(row), np.float32), (row, container[row, view])), (n, count))
     node = np.arange(n)
-    thresholds: list[int] | None = None
+    thresholds: list[int] | None = None  # falling minima of observers (Eq. O.12), known after the first turn
     while True:
         first, second, supporters, observers = agreeing_pairs(holders, views)
+        # The minima come from pairs of single masks, before anything is joined.
         if thresholds is None:
             if not len(first):
                 return numbered_by_first(node)
             found = np.floor(np.percentile(observers, PERCENTILES)).astype(int)
             thresholds = sorted({max(int(number), MIN_OBSERVERS) for number in found}, reverse=True)
-        agree = supporters >= consensus * observers
+        agree = supporters >= consensus * observers  # Eq. O.11
+        # Minima that join nothing are passed over without a new count of pairs.
         while thresholds:
             linked = agree & (observers >= thresholds[0])
             if linked.any():
@@ -244,6 +250,7 @@ def _join(container: Array, count: int, consensus: float) -> Array:
         if not thresholds:
             return numbered_by_first(node)
         group = component_labels(len(views), first[linked], second[linked])
+        # -------- joined nodes have the unions of views and masks; a minimum is used once --------
         node = group[node]
         views, holders = _merged(views, holders, group)
         thresholds.pop(0)
@@ -260,9 +267,9 @@ def agreeing_pairs(holders: Any, views: Array) -> tuple[Array, Array, Array, Arr
     for rows in _blocks(holders.shape[0]):
         shared = (holders[rows] @ holders.T).tocoo()
         i, j = shared.row + rows.start, shared.col
-        above = j > i
+        above = j > i  # each pair once, no node with itself
         i, j, supporters = i[above], j[above], shared.data[above]
-        observers = np.bitwise_count(views[i] & views[j]).sum(1, dtype=np.int64)
+        observers = np.bitwise_count(views[i] & views[j]).sum(1, dtype=np.int64)  # size of the intersection of V_i and V_j
         parts.append((i, j, supporters, observers))
     i, j, supporters, observers = (np.concatenate(column) for column in zip(*parts, strict=True))
     seen = observers > 0
@@ -274,10 +281,10 @@ def _merged(views: Array, holders: Any, group: Array) -> tuple[Array, Any]:
     from scipy.sparse import csr_matrix
 
     order = np.argsort(group, kind="stable")
-    start = np.flatnonzero(np.r_[True, np.diff(group[order]) > 0])
+    start = np.flatnonzero(np.r_[True, np.diff(group[order]) > 0])  # no group is empty, as `reduceat` needs
     together = csr_matrix((np.ones(len(group), np.float32), (group, np.arange(len(group)))), (len(start), len(group)))
     union = (together @ holders).tocsr()
-    union.data[:] = 1
+    union.data[:] = 1  # the product counts a mask once for each node that has it
     return np.bitwise_or.reduceat(views[order], start, axis=0), union
 
 

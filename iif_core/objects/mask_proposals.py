@@ -32,11 +32,12 @@ def suppress_overlaps(masks: ArrayLike, score: ArrayLike, overlap: float) -> Arr
     """
     masks = np.asarray(masks, bool)
     flat = masks.reshape(len(masks), masks[:1].size if len(masks) else 0)
+    # 64 pixels in one word; the padding is false.
     bits = np.packbits(np.pad(flat, ((0, 0), (0, -flat.shape[1] % 64))), axis=1).view(np.uint64)
     area = flat.sum(1)
     kept: list[int] = []
     for i in np.argsort(-np.asarray(score), kind="stable").tolist():
         common = np.bitwise_count(bits[kept] & bits[i]).sum(1, dtype=np.int64)
-        if not (common > overlap * (area[kept] + area[i] - common)).any():
+        if not (common > overlap * (area[kept] + area[i] - common)).any():  # Eq. O.19 times the union, which may be 0
             kept.append(i)
     return np.array(kept, np.int64)

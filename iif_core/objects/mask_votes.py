@@ -54,9 +54,10 @@ def view_votes(face: Array, key: Array, clustered: Array, masked: Array, count: 
     Returns:
         Votes of the view.
     """
-    seen = np.bincount(face, minlength=count)
+    seen = np.bincount(face, minlength=count)  # pixels of each face in this view
     keys, which = np.unique(key[clustered], return_inverse=True)
     width = max(len(keys), 1)
+    # One number for a pair of face and key, so that one sort counts the pixels of all pairs.
     pair, pixels = np.unique(face[clustered].astype(np.int64) * width + which, return_counts=True)
     rows, at = pair // width, pair % width
     outside = np.bincount(face[~masked], minlength=count) / np.maximum(seen, 1)
@@ -76,7 +77,7 @@ def split_apart(keys: Array) -> tuple[Array, Array]:
     """
     part = component_labels(len(keys), *neighbour_pairs(keys).T)
     cluster = np.zeros(part.max(initial=-1) + 1, np.int64)
-    cluster[part] = unpack_keys(keys)[1]
+    cluster[part] = unpack_keys(keys)[1]  # all voxels of a part agree
     return part, cluster
 
 
@@ -95,27 +96,30 @@ def elect_labels(face: Array, label: Array, weight: Array, share: Array, piece: 
         piece_views: weight of the vote of a piece.
 
     Returns:
-        (F,) int64 labels; -1 where neither the face nor its piece has a vote.
+        (F,) int64 labels; -1 for a face without a vote.
     """
     out = np.full(len(piece), -1, np.int64)
     if not len(face):
         return out
+    # -------- votes of the pieces: W(piece, l), the favourite of each piece, N(piece) --------
     span, pieces = int(label.max()) + 1, int(piece.max()) + 1
     of_piece = piece[face].astype(np.int64)
     pair, row = np.unique(of_piece * span + label, return_inverse=True)
     total = np.bincount(row, weight, len(pair))
-    order = np.lexsort((pair % span, -total, pair // span))
+    order = np.lexsort((pair % span, -total, pair // span))  # by piece, heaviest first, then lowest label
     held, first = np.unique(pair[order] // span, return_index=True)
     favourite = np.zeros(pieces, np.int64)
     favourite[held] = pair[order][first] % span
-    views = np.bincount(of_piece, share, pieces)
+    views = np.bincount(of_piece, share, pieces)  # N(piece), in views of a face
 
+    # -------- candidates of the faces that have a vote: their own labels, and the favourite with weight 0 --------
     voted = np.unique(face).astype(np.int64)
     code = np.concatenate([face.astype(np.int64) * span + label, voted * span + favourite[piece[voted]]])
     candidate, row = np.unique(code, return_inverse=True)
     score = np.bincount(row, np.concatenate([weight, np.zeros(len(voted))]), len(candidate))
     face_of, label_of = candidate // span, candidate % span
     of_piece = piece[face_of].astype(np.int64)
+    # Every candidate has a vote in its piece, so the search finds its exact pair and N is not 0.
     score += piece_views * total[np.searchsorted(pair, of_piece * span + label_of)] / views[of_piece]
     order = np.lexsort((label_of, -score, face_of))
     first = np.unique(face_of[order], return_index=True)[1]
@@ -139,6 +143,7 @@ def label_faces(votes: Votes, cluster_size: Array, cluster_masks: Array, piece: 
         Part of every face (F,) int64, -1 = none; faces that lie mostly outside masks, (F,) bool; and for every part the share
         of the pixels on its faces that voted for it.
     """
+    # -------- which votes count: clusters of one mask only where no other cluster votes --------
     keys, which = np.unique(votes.key, return_inverse=True)
     part_of_key, cluster = split_apart(keys)
     part = part_of_key[which]
@@ -147,11 +152,13 @@ def label_faces(votes: Votes, cluster_size: Array, cluster_masks: Array, piece: 
     firm[votes.face[~lone]] = True
     counted = ~lone | ~firm[votes.face]
     inside = np.bincount(votes.face[counted], votes.share[counted], len(piece))
+    # -------- bare faces (Eq. O.15) lose their votes; the others are weighted and elected (Eq. O.13, O.14) --------
     bare = votes.outside > inside
     counted &= ~bare[votes.face]
     face, part, share = votes.face[counted], part[counted], votes.share[counted]
     weight = share / np.sqrt(np.maximum(cluster_size[cluster[part]], 1.0))
     label = elect_labels(face, part, weight, share, piece)
+    # -------- agreement: pixels for the part over pixels on its faces --------
     pixels = votes.pixels[counted]
     mine = label[face] == part
     agreeing = np.bincount(part[mine], pixels[mine], len(cluster))
@@ -199,15 +206,18 @@ def part_objects(home: Array, seen: Sightings) -> Array:
     `home` (n,) is the object of every fragment; returns (n,) int64.
     """
     home = np.array(home, np.int64)
+    # waits: fragments that are in no grown object yet; size: pixels of each fragment over all views.
     waits, size = np.ones(len(home), bool), np.bincount(seen.fragment, seen.pixels, len(home))
     span = int(seen.view.max(initial=0)) + 1
     _, pair = np.unique(seen.fragment * span + seen.view, return_inverse=True)
+    # (n,) share of a fragment's pixels in one view that lie in the mask of the row.
     share = seen.pixels / np.bincount(pair, seen.pixels)[pair]
     waits[_largest(home, size, waits)] = False
     while waits.any():
         together, views = _support(home, waits, seen, share)
         joins = waits & (views > 0) & (1 + together > 0.5 * (1 + views) + TIE_VIEWS)
         if not joins.any():
+            # No view says anything about these, so the election stands.
             joins = waits & (views == 0)
         waits &= ~joins
         if not joins.any():
@@ -225,6 +235,7 @@ def _largest(home: Array, size: Array, waits: Array) -> Array:
 
 def _support(home: Array, waits: Array, seen: Sightings, share: Array) -> tuple[Array, Array]:
     """For every waiting fragment: sum of t_f, and the number of views that see it with its object; 0 for other fragments."""
+    # Objects that still wait for fragments; others need no more work.
     growing = np.zeros(int(home.max()) + 1, bool)
     growing[home[waits]] = True
     rows = np.flatnonzero(growing[home[seen.fragment]])
@@ -232,13 +243,16 @@ def _support(home: Array, waits: Array, seen: Sightings, share: Array) -> tuple[
     place = home[seen.fragment[rows]] * views + seen.view[rows]
     waiting = waits[seen.fragment[rows]]
 
+    # -------- the mask that holds most of each growing object in each view --------
     there = rows[~waiting]
     at, chosen, _ = _main_masks(place[~waiting], seen.mask[there], seen.pixels[there])
     rows, place = rows[waiting], place[waiting]
+    # -------- waiting fragments in views that see their object too --------
     both = np.isin(place, at)
     rows, place = rows[both], place[both]
     inside = seen.mask[rows] == chosen[np.searchsorted(at, place)]
     fragment = seen.fragment[rows]
+    # Shares of a fragment in one view add up to 1, so the second sum counts views.
     return np.bincount(fragment, share[rows] * inside, len(home)), np.bincount(fragment, share[rows], len(home))
 
 
@@ -267,8 +281,10 @@ def join_objects(home: Array, seen: Sightings) -> Array:
     views, masks = int(seen.view.max(initial=0)) + 1, int(seen.mask.max(initial=0)) + 1
     while True:
         objects, at = np.unique(home, return_inverse=True)
+        # A share above 1/2 leaves no second mask; an object that a view cuts up evenly is not seen by it.
         place, mask, share = _main_masks(at[seen.fragment] * views + seen.view, seen.mask, seen.pixels)
         node, view, mask = place[share > 0.5] // views, place[share > 0.5] % views, mask[share > 0.5]
+        # Masks are numbered over all views, so two objects share a supporter only within one view.
         holders = csr_matrix((np.ones(len(node), np.float32), (node, view * masks + mask)), (len(objects), views * masks))
         by = np.zeros((len(objects), views), bool)
         by[node, view] = True

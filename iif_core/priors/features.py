@@ -70,9 +70,11 @@ KNOWN_SPREAD = 0.3
 """Standard deviation of an object's log albedo as a first prediction states it."""
 COMPUTED_SHARE = 0.7
 """Weight of the computed light in a second look; the gathered light has the rest (Eq. P.29)."""
+# Range in which the quotient y is kept, natural logarithm.
 QUOTIENT = (-5.5, 2.5)
 FARTHEST, BRIGHTEST = 10.0, 30.0
 """Largest distance in metres, and radiance in means of the scene, of what a mirrored ray meets."""
+# Bins of 1/64 of a natural logarithm; what lies outside falls into the first or the last one.
 _MEDIAN_BINS, _MEDIAN_RANGE = 1024, (-10.0, 6.0)
 
 
@@ -189,7 +191,7 @@ class SceneLight:
 
 
 def scene_light(views: Views, trace: Trace, mean_albedo: float, seed: int = 0) -> SceneLight:
-    """Estimate the light from all views (Eq. L.56 to L.58), scaled to a mean albedo (Eq. P.16).
+    """Estimate the light from all views (Eq. L.55 to L.58), scaled to a mean albedo (Eq. P.16).
 
     Raises:
         InputError: no view shows any surface.
@@ -202,6 +204,7 @@ def scene_light(views: Views, trace: Trace, mean_albedo: float, seed: int = 0) -
 
 def _levelled(cells: SurfaceCells, log_light: NDArray, mean_albedo: float) -> NDArray:
     """Scale each version of the light so that the albedos have the wanted mean (Eq. P.16)."""
+    # Each reach leaves another mean albedo, so each is scaled by itself.
     levels = [albedo_level(np.exp(cells.log_radiance - own), cells.pixels, mean_albedo) for own in log_light]
     return log_light - np.log(levels)[:, None, None]
 
@@ -227,6 +230,7 @@ def gather_views(
     Raises:
         InputError: no view shows any surface.
     """
+    # -------- the light, and what is looked up in each view --------
     light = scene_light(views, trace, mean_albedo, seed)
     tables, lights, cameras = [], [], []
 
@@ -244,6 +248,7 @@ def gather_views(
         tables.append(ViewTable(*(keep(array) for array in table)))
         lights.append(ViewLight(keep(own.row), keep(own.weight), keep(own.mirrored), keep(own.distance)))
         cameras.append(camera)
+    # -------- which views see the same surface; medians and pooled regression of the objects --------
     neighbours = _neighbours(light.seen)
     group, median = _medians(views, light, lights)
     pool = _Pool(group)
@@ -270,7 +275,9 @@ def gather_again(gathering: Gathering, views: Views, log_albedo: NDArray, mean_a
         mean_albedo: as for `gather_views`.
     """
     light = gathering.light
+    # Objects without a first prediction keep the prior mean.
     known = np.nan_to_num(log_albedo, nan=np.log(mean_albedo))
+    # `estimate_log_light` wants one row for each group of the cells, in the order of their ids.
     albedo = np.exp(known[np.searchsorted(gathering.group, np.unique(light.cells.group))])
     found = estimate_log_light(light.cells, light.gathered, albedo, REACHES, KNOWN_SPREAD)
     light = replace(light, log_light=_levelled(light.cells, found, mean_albedo))
@@ -295,21 +302,23 @@ def with_computed_light(gathering: Gathering, views: Views, irradiance: Iterable
     """
     light = gathering.light
     cells = len(light.cells)
-    # --- mean log light of each cell, over the pixels that are nearest to it
+    # -------- mean log light of each cell, over the pixels that are nearest to it --------
     total, count = np.zeros((cells, 3)), np.zeros(cells)
     for i, (own, picture) in enumerate(zip(gathering.lights, irradiance, strict=True)):
         value = picture[views[i].depth > 0].astype(np.float64)
         known = np.isfinite(value).all(1) & (value > 0).all(1)
-        nearest = own.row[known, 0].astype(np.int64)
+        nearest = own.row[known, 0].astype(np.int64)  # rows are in the order of distance
         count += np.bincount(nearest, minlength=cells)
         for c in range(3):
             total[:, c] += np.bincount(nearest, np.log(value[known, c]), cells)
     known = count > 0
     if not known.any():
         return gathering
-    # --- mix; the median of the change is the unknown factor, and lamps, whose own light means nothing, hardly move a median
+    # -------- mix (Eq. P.29) --------
+    # The median of the change is the unknown factor; lamps, whose own light means nothing, hardly move a median.
     change = total[known] / count[known, None] - light.log_light[0][known]
     log_light = light.log_light.copy()
+    # The same change for both reaches keeps their difference, which is input `dy`.
     log_light[:, known] += COMPUTED_SHARE * (change - np.median(change, 0))
     light = replace(light, log_light=log_light)
     _, median = _medians(views, light, gathering.lights)
@@ -341,23 +350,25 @@ def features(gathering: Gathering, views: Views, i: int) -> NDArray:
     own = gathering.tables[i]
     out = np.zeros((len(CHANNELS), n), np.float32)
     put = _Writer(out, hit)
-    # --- the photograph, with and without the light
+    # -------- the photograph, with and without the light --------
     light = gathering.light.log_at(gathering.lights[i].row, gathering.lights[i].weight)
     y = (own_log[hit] - light[0]).clip(*QUOTIENT)
     put("y_r", y)
     put("dy_r", (light[0] - light[1]).clip(-2, 2))
-    grey = own_log.mean(-1)[view.used.ravel()]
+    grey = own_log.mean(-1)[view.used.ravel()]  # one number for a pixel, so that the colour of the view stays in the input
     put("i_r", (own_log[hit] - (np.median(grey) if len(grey) else 0.0)).clip(-5, 4))
-    # --- over the views that see the same point, relative to this one
+    # -------- over the views that see the same point, relative to this one --------
+    # The view's own value is rounded to the same steps as the samples, so a point that no other view sees has exactly 0.
     relative = (quantiles(samples, count) - from_steps(own.log_radiance[hit])[:, None]).clip(-4, 4)
     put("low_r", relative[:, 0])
     put("mid_r", relative[:, 1])
     put("high", relative[:, 2].mean(-1))
     put("top", relative[:, 3].mean(-1))
     put("count", np.log1p(count).clip(0, 4))
-    # --- what the mirrored ray meets
+    # -------- what the mirrored ray meets --------
     known = np.isfinite(own.mirrored[hit])
     distance = gathering.lights[i].distance.astype(np.float32)
+    # The same unit and the same floor as in `_prepared`, so that their difference compares like with like.
     floored = np.log(np.maximum(view.radiance().reshape(n, 3)[hit] / gathering.light.mean, 1e-3))
     met = gathering.lights[i].mirrored.astype(np.float32)
     put("m_r", np.where(known[:, None], met - floored, 0).clip(-5, 5))
@@ -365,18 +376,20 @@ def features(gathering: Gathering, views: Views, i: int) -> NDArray:
     put("m_far", np.log1p(np.nan_to_num(distance, nan=0.0)))
     for name, value in zip(("slope", "corr", "rest"), _regression(sums, own.luminance[hit].astype(np.float64)), strict=True):
         put(name, value.clip(-3, 3))
-    # --- shape
+    # -------- shape --------
     normal = view.normals.reshape(n, 3)[hit]
+    # Row vectors: n R is R' n, the normal in the axes of the camera.
     put("n_x", normal @ view.world_from_camera[:3, :3].astype(np.float32))
     towards = -view.rays().reshape(n, 3)[hit]
-    put("nov", (normal * towards).sum(-1) / np.linalg.norm(towards, axis=-1))
+    put("nov", (normal * towards).sum(-1) / np.linalg.norm(towards, axis=-1))  # rays have length 1 in z, not unit length
     depth = np.log(np.maximum(view.depth.ravel()[hit], 0.05))
     put("depth", (depth - np.median(depth) if len(hit) else depth).clip(-2, 2))
     put("border", borders(view.group).ravel()[hit])
     put("hit", np.ones(len(hit)))
     put("valid", view.used.ravel()[hit])
     put("saturated", view.saturated.ravel()[hit])
-    # --- the object as a whole
+    # -------- the object as a whole --------
+    # Every id that shows surface has a row, because the medians were taken over the same pixels.
     row = np.searchsorted(gathering.group, view.group.ravel()[hit])
     put("g_r", gathering.median[row] - y)
     put("g_slope", gathering.slope[row])
@@ -413,6 +426,7 @@ def camera_of(view: ViewArrays) -> Camera:
 
 def _cells(views: Views) -> tuple[SurfaceCells, float, list[NDArray]]:
     """Surface cells of all views, their mean radiance, and for each view the coarse blocks of surface that it sees."""
+    # -------- extent of the surface and size of a pixel; the cells need both before the first pixel --------
     footprints, low, high = [], np.full(3, np.inf), np.full(3, -np.inf)
     for i in range(len(views)):
         view = views[i]
@@ -423,8 +437,10 @@ def _cells(views: Views) -> tuple[SurfaceCells, float, list[NDArray]]:
             low, high = np.minimum(low, points.min(0)), np.maximum(high, points.max(0))
     if not footprints:
         raise InputError("prior: no photograph shows the mesh; compare poses and mesh (`alignment` in capture/capture.json)")
+    # -------- sums over the pixels of each cell; blocks of surface of each view --------
     builder = SurfaceCellsBuilder(np.stack([low, high]), CELL_FOOTPRINTS * float(np.median(footprints)))
     total, count, seen = 0.0, 0, []
+    # Fixed here: the builder doubles its edge when there are too many cells, and blocks of all views must agree.
     block = 4 * builder.edge
     for i in range(len(views)):
         view = views[i]
@@ -433,7 +449,7 @@ def _cells(views: Views) -> tuple[SurfaceCells, float, list[NDArray]]:
         builder.add(points[use], view.normals[use], view.group[use], radiance, view.saturated[use], view.exposure)
         total, count = total + float(radiance.sum(dtype=np.float64)), count + radiance.size
         where = np.floor((points[view.depth > 0] - low) / block).astype(np.int64)
-        seen.append(np.unique((where[:, 0] << 42) | (where[:, 1] << 21) | where[:, 2]))
+        seen.append(np.unique((where[:, 0] << 42) | (where[:, 1] << 21) | where[:, 2]))  # three indices of 21 bits
     return builder.finish(), max(total / max(count, 1), 1e-6), seen
 
 
@@ -455,14 +471,16 @@ def _prepared(view: ViewArrays, light: SceneLight, trace: Trace) -> tuple[ViewTa
     # Mirrored rays, and the photographed radiance of the voxel that they meet.
     towards = -view.rays().reshape(n, 3)[hit]
     towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+    # Mirror direction 2 (n . w) n - w of the unit vector w to the camera; of unit length, so t is in metres.
     way = (2 * (normals * towards).sum(-1, keepdims=True) * normals - towards).astype(np.float32)
-    start = (points + 1e-3 * normals).astype(np.float32)
+    start = (points + 1e-3 * normals).astype(np.float32)  # off the face, which the ray would meet at once
     face, t = trace(start, way)
     met = np.flatnonzero(np.asarray(face) >= 0)
     t = np.asarray(t, np.float64)
     voxel = find_voxel(cells, start[met] + t[met, None] * way[met])
     seen = voxel >= 0
     radiance = cells.voxel_radiance[voxel[seen]] / light.mean
+    # By pixel that shows surface, for the view itself; `luminance` by pixel of the picture, as other views look it up.
     distance, mirrored = np.full(len(hit), np.nan, np.float16), np.zeros((len(hit), 3), np.float16)
     luminance = np.full(n, np.nan, np.float32)
     distance[met] = np.minimum(t[met], FARTHEST)
@@ -477,6 +495,7 @@ def _prepared(view: ViewArrays, light: SceneLight, trace: Trace) -> tuple[ViewTa
         luminance,
     )
     row, weight = light.around(view)
+    # 16 bits hold the row of a cell, since there are at most MAX_CELLS = 30,000 of them.
     return table, ViewLight(row.astype(np.uint16), weight.astype(np.float16), mirrored, distance)
 
 
@@ -486,11 +505,12 @@ def _neighbours(seen: list[NDArray]) -> list[NDArray]:
 
     blocks, column = np.unique(np.concatenate(seen), return_inverse=True)
     starts = np.r_[0, np.cumsum([len(own) for own in seen])]
+    # (views, blocks); the product of two rows counts the blocks that both views see.
     incidence = csr_matrix((np.ones(len(column), np.int32), column.ravel(), starts), (len(seen), len(blocks)))
     out = []
     for i in range(len(seen)):
         shared = (incidence @ incidence[i].T).toarray().ravel()
-        shared[i] = np.iinfo(np.int32).max
+        shared[i] = np.iinfo(np.int32).max  # the view itself comes first, as `_reprojected` expects
         best = np.argsort(-shared, kind="stable")[:MAX_VIEWS]
         out.append(best[shared[best] > 0])
     return out
@@ -513,6 +533,7 @@ def _reprojected(
     count, sums = np.zeros(len(index), np.int32), np.zeros((len(index), 6))
     none = np.full(len(index), -1, np.int64)
     for number, u in enumerate(neighbours):
+        # The first neighbour is the view itself: its pixels are known and need no projection.
         own = none if number else index.astype(np.int64)
         add_samples(point, normal, own, cameras[int(u)], tables[int(u)], samples, count, sums)
     return samples, count, sums
@@ -520,8 +541,9 @@ def _reprojected(
 
 def _moments(sums: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]:
     """Number, means of L and X, and sums of centred L X, X X and L L, from the sums of `add_samples`."""
-    s = np.maximum(sums[:, 0], 1e-6)
+    s = np.maximum(sums[:, 0], 1e-6)  # no sample: all sums are 0
     y, x = sums[:, 1] / s, sums[:, 2] / s
+    # Centred sums are differences, which rounding can make negative.
     return s, y, x, sums[:, 5] - s * y * x, np.maximum(sums[:, 4] - s * x * x, 0), np.maximum(sums[:, 3] - s * y * y, 0)
 
 
@@ -529,8 +551,11 @@ def _regression(sums: NDArray, luminance: NDArray) -> tuple[NDArray, NDArray, ND
     """Slope and correlation over the views of radiance L on mirrored radiance X, ridge-regularised, and what X does not explain:
     log of the mean of L - slope X, relative to this view."""
     s, y, x, cov, vx, vy = _moments(sums)
-    slope = cov / (vx + 0.02 * s * (x**2 + 0.05))
+    slope = cov / (vx + 0.02 * s * (x**2 + 0.05))  # Eq. P.25
+    # The addend stands for a standard deviation of 10 % of both means: radiance that hardly varies has a correlation near 0, not
+    # a quotient of noise.
     correlation = cov / np.sqrt(vx * vy + 1e-4 * s * s * (y**2 + 1e-4) * (x**2 + 0.01) + 1e-12)
+    # What X explains may exceed the mean; at least 5 % of it stays.
     rest = np.log(np.maximum(y - slope.clip(0, 1.5) * x, 0.05 * y) + 1e-4) - np.log(luminance + 1e-4)
     return slope.clip(-0.5, 1.5), correlation, rest
 
@@ -587,6 +612,7 @@ class _Medians:
     def values(self) -> NDArray:
         """Return the medians (G, 3), to a bin of 1/64; 0 for objects without a pixel that counts."""
         total = self.counts.sum(-1)
+        # First bin at which the count passes half of the pixels.
         middle = (np.cumsum(self.counts, -1) > (total // 2)[..., None]).argmax(-1)
         low, high = _MEDIAN_RANGE
         return np.where(total > 0, low + (middle + 0.5) * (high - low) / _MEDIAN_BINS, 0.0)

@@ -50,12 +50,14 @@ def combined(
     out = np.empty((samples, *heads.shape[1:3], 5), np.float32)
     scale = np.empty((*heads.shape[1:3], 3), np.float32)
     for number, (values, own) in enumerate(_PROPERTIES):
+        # (M, H, W, 3 or 1) and (M, H, W, 1)
         maps, log_scale = heads[..., values], heads[..., own : own + 1]
+        # 1 / s^2 relative to the surest head of each pixel (Eq. P.26): its weight is 1, so nothing overflows and no total is 0.
         weight = np.exp(-2 * (log_scale - log_scale.min(0)))
         total = weight.sum(0)
         middle = (weight * maps).sum(0) / total
-        share = spread if samples > 1 else 0.0
-        out[..., values] = middle + share * (maps[:samples] - middle)
+        share = spread if samples > 1 else 0.0  # a single head is right only where it wins
+        out[..., values] = middle + share * (maps[:samples] - middle)  # Eq. P.27
         scale[..., number] = calibration[number] * (np.exp(log_scale) * weight).sum(0)[..., 0] / total[..., 0]
     out[..., :3] = np.exp(out[..., :3])
     # d albedo = albedo d(log albedo)

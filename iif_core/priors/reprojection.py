@@ -92,6 +92,7 @@ def add_samples(point, normal, own, camera, table, samples, count, sums):
             depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z
             if depth <= NEAREST:
                 continue
+            # Pixel (i, j) covers [j, j + 1) x [i, i + 1), so the integer part of (v, u) is its index.
             u = fx * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z) / depth + cx
             v = fy * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z) / depth + cy
             if not (0 <= u < camera.width and 0 <= v < camera.height):
@@ -103,7 +104,7 @@ def add_samples(point, normal, own, camera, table, samples, count, sums):
             cosine = np.float32(0.0)
             for a in range(3):
                 cosine += normal[i, a] * table.normal[at, a]
-            if cosine <= NORMAL_COSINE * NORMAL_STEPS:
+            if cosine <= NORMAL_COSINE * NORMAL_STEPS:  # normals of the table are in steps
                 continue
         if count[i] == samples.shape[1]:
             continue
@@ -112,7 +113,7 @@ def add_samples(point, normal, own, camera, table, samples, count, sums):
         count[i] += 1
         mirrored = np.float64(table.mirrored[at])  # NaN differs from itself
         if mirrored == mirrored:
-            luminance = np.float64(table.luminance[at])
+            luminance = np.float64(table.luminance[at])  # float64: centred sums are differences of these
             sums[i, 0] += 1
             sums[i, 1] += luminance
             sums[i, 2] += mirrored
@@ -140,5 +141,5 @@ def quantiles(samples, count):
                 samples[i, k, c] = value
             for q in range(len(QUANTILES)):
                 if n > 0:
-                    out[i, q, c] = samples[i, int(np.rint((n - 1) * QUANTILES[q])), c]
+                    out[i, q, c] = samples[i, int(np.rint((n - 1) * QUANTILES[q])), c]  # nearest rank
     return out

@@ -68,16 +68,18 @@ def retinex_predictions(
         raise InputError(f"retinex prior: light of shape {np.shape(light)} for a photograph of {linear.shape}")
     if samples < 1 or not 0 < mean_albedo < 1:
         raise InputError(f"retinex prior: samples {samples} (at least 1), mean_albedo {mean_albedo} (between 0 and 1)")
+    # -------- log radiance (H, W, 3); a pixel that does not count has the floor, and its steps are never material --------
     known = np.isfinite(linear).all(-1) & (True if valid is None else np.asarray(valid, bool))
     log = np.log(np.maximum(np.where(known[..., None], linear, DARKEST), DARKEST))
-    spread = np.linspace(0, 1, samples) if samples > 1 else np.array([0.5])
+    spread = np.linspace(0, 1, samples) if samples > 1 else np.array([0.5])  # exponent of Eq. P.13
     out = np.empty((samples, *shape, 5), np.float32)
     stay = 0.0 if light is None else STAY_WEIGHT  # without an estimate of the light, slow changes are light
     lights = np.zeros((1, *linear.shape)) if light is None else np.asarray(light, np.float64)
+    # -------- prediction k divides by light k mod m; its steps are found once for all thresholds --------
     for number, own in enumerate(lights[:samples]):
         image = log - own
         if light is not None:
-            image = np.clip(image, *np.log(ALBEDO))
+            image = np.clip(image, *np.log(ALBEDO))  # Eq. P.10
         steps = [_Steps(image, axis, known, object_id, normals) for axis in (0, 1)]
         for k in range(number, samples, len(lights)):
             threshold = THRESHOLDS[0] * (THRESHOLDS[1] / THRESHOLDS[0]) ** spread[k]
@@ -97,6 +99,7 @@ def albedo_level(albedo: NDArray, weight: NDArray, mean_albedo: float) -> float:
         return 1.0
     mean = float(albedo.mean(-1) @ weight) / total
     order = np.argsort(albedo.max(-1), kind="stable")
+    # Weighted quantile 1 - BRIGHT_SHARE of the brightest channel.
     place = min(int(np.searchsorted(np.cumsum(weight[order]), (1 - BRIGHT_SHARE) * total)), len(order) - 1)
     return min(mean_albedo / max(mean, 1e-9), BRIGHT / max(float(albedo.max(-1)[order[place]]), 1e-9))
 
@@ -108,6 +111,8 @@ def _draws(shape: tuple[int, int], samples: int, object_id: NDArray | None, seed
     objects, row = np.unique(ids, return_inverse=True)
     draws = np.empty((len(objects), samples, 2))
     for i, o in enumerate(objects):
+        # The object is part of the seed, so an object draws the same in all views. 0x726574 spells "ret" and keeps these draws
+        # apart from others with the same seed.
         rng = np.random.default_rng([seed, 0x726574, int(o) + 1])
         draws[i, :, 0] = np.clip(ROUGHNESS[0] + ROUGHNESS[1] * rng.standard_normal(samples), 0.2, 1)
         draws[i, :, 1] = METALLIC[0] + (METALLIC[1] - METALLIC[0]) * rng.random(samples)
@@ -142,6 +147,8 @@ class _Steps:
     def material(self, threshold: float) -> NDArray:
         """Steps (.., 3) of the log reflectance: the whole difference where it is material, 0 where it is light (Eq. P.12)."""
         strong = (np.abs(self.luminance) > threshold) | (self.chromaticity > CHROMATICITY_SHARE * threshold)
+        # The limit is that for the largest threshold in every hypothesis: where surface turns, only a clear change of colour is
+        # material.
         grey_turn = self.turn & (self.chromaticity <= CHROMATICITY_SHARE * THRESHOLDS[1])
         kept = self.usable & (self.border | (strong & ~grey_turn))
         return np.where(kept[..., None], self.difference, 0.0)
@@ -154,11 +161,14 @@ def _integrated(steps: list[NDArray], image: NDArray, stay: float) -> NDArray:
     """
     from scipy.fft import dctn, idctn
 
+    # -------- right-hand side of the normal equations: h y plus the negative divergence of the steps --------
+    # The step s from pixel i to i + 1 adds -s to the equation of i and +s to the equation of i + 1.
     right = stay * image
     right[:-1] -= steps[0]
     right[1:] += steps[0]
     right[:, :-1] -= steps[1]
     right[:, 1:] += steps[1]
+    # -------- eigenvalues of the second difference with free borders, in the basis of the cosine transform (Eq. P.15) --------
     y, x = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in image.shape[:2])
     eigenvalue = y[:, None] + x[None, :] + stay
     if stay == 0:
@@ -172,8 +182,10 @@ def _scaled(reflectance: NDArray, known: NDArray, mean_albedo: float) -> NDArray
     values = reflectance[known] if known.any() else reflectance.reshape(-1, 3)
     if not values.size:
         return reflectance
+    # The mean after clipping grows with the gain. At `high` the darkest value reaches twice the wanted mean, or 1, so the answer
+    # lies between.
     low, high = 0.0, 2 * mean_albedo / max(values.min(), 1e-6)
-    for _ in range(60):
+    for _ in range(60):  # more halvings than double precision has bits
         middle = 0.5 * (low + high)
         if np.minimum(values * middle, 1).mean() < mean_albedo:
             low = middle

@@ -30,16 +30,19 @@ def enlarged(maps: NDArray, scale: NDArray, small: ViewArrays, full: ViewArrays,
     Returns:
         (K, H, W, 5) float32 and (H, W, 3) float32.
     """
+    # -------- statistics of the guide, log radiance, in 3 x 3 small pixels --------
     near = _Neighbours(small, full, factor)
     out = np.empty((len(maps), *full.depth.shape, 5), np.float32)
     guide, full_guide = log_radiance(small), log_radiance(full)
     mean = _box(guide)
-    variance = np.maximum(_box(guide**2) - mean**2, 0)
+    variance = np.maximum(_box(guide**2) - mean**2, 0)  # a difference, which rounding can make negative
     for k, own in enumerate(maps):
         albedo = np.log(np.maximum(own[..., :3], DARKEST_ALBEDO))
         middle = _box(albedo)
         # log albedo = gain * log photograph + offset, around each pixel: gain 1 where the light is even, 0 where the albedo is.
         gain = ((_box(guide * albedo) - mean * middle) / (variance + RIDGE)).clip(0, 1)
+        # -------- interpolate gain and offset, then apply them to the photograph at its own size (Eq. P.28) --------
+        # Channels: gain (3), offset (3), roughness, metallic.
         line = near(np.concatenate([gain, middle - gain * mean, own[..., 3:]], -1))
         out[k, ..., :3] = np.exp(line[..., :3] * full_guide + line[..., 3:6])
         out[k, ..., 3:] = line[..., 6:]
@@ -58,6 +61,8 @@ class _Neighbours:
 
     def __init__(self, small: ViewArrays, full: ViewArrays, factor: int):
         (h, w), (height, width) = small.depth.shape, full.depth.shape
+        # Positions in units of small pixels. Small pixel j shows the surface of full pixel factor j + factor // 2, which lies at
+        # j.
         y, x = ((np.arange(n) - factor // 2) / factor for n in (height, width))
         self.places: list[tuple[NDArray, NDArray]] = []
         weights = []
@@ -67,6 +72,7 @@ class _Neighbours:
                 weight = np.maximum(1 - np.abs(y - row), 0)[:, None] * np.maximum(1 - np.abs(x - column), 0)
                 at = row.clip(0, h - 1)[:, None], column.clip(0, w - 1)[None]
                 cosine = (small.normals[at] * full.normals).sum(-1)
+                # Pixels without surface have no normal.
                 same = (small.group[at] == full.group) & ((cosine > SAME_SIDE) | (full.depth == 0))
                 self.places.append(at)
                 weights.append((weight + 1e-6) * np.where(same, 1.0, ELSEWHERE))

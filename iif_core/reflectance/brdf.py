@@ -17,7 +17,7 @@ R_MIN = 0.02
 """Smallest perceptual roughness; D exceeds the range of float32 below it (docs/method/numerics.md#roughness-at-zero)."""
 
 F0_DIELECTRIC = 0.04
-_MIN_VOH = 1e-4
+_MIN_VOH = 1e-4  # keeps the density finite where viewer and half vector are nearly at right angles
 _XYZ = Sequence[Any]
 
 
@@ -61,6 +61,7 @@ def half_angles(xp: Namespace, normal: _XYZ, wi: _XYZ, wo: _XYZ) -> tuple[Any, A
     Returns:
         NoL, NoV, NoH, VoH (clamped to >= 0) and sin2_h.
     """
+    # The floor leaves h = 0 for opposite directions instead of 0 / 0.
     hx, hy, hz = wi[0] + wo[0], wi[1] + wo[1], wi[2] + wo[2]
     scale = 1 / xp.maximum(xp.sqrt(hx * hx + hy * hy + hz * hz), 1e-8)
     h = (hx * scale, hy * scale, hz * scale)
@@ -91,6 +92,7 @@ def normal_distribution(xp: Namespace, NoH: Any, sin2_h: Any, r: Any) -> Any:
     """
     r = xp.maximum(r, R_MIN)
     alpha2 = (r * r) * (r * r)
+    # A sum of positive terms, where the textbook form subtracts two numbers near 1 (Eq. R.4, R.8).
     spread = xp.maximum(alpha2 * NoH * NoH + sin2_h, alpha2)
     return alpha2 / (xp.pi * spread * spread)
 
@@ -111,9 +113,11 @@ def lobes(xp: Namespace, NoL: Any, NoV: Any, NoH: Any, VoH: Any, sin2_h: Any, r:
     """
     r = xp.maximum(r, R_MIN)
     k = (r + 1) * (r + 1) * 0.125
+    # G / (NoL NoV) in one expression (Eq. R.5): the cosines in the denominator of Eq. R.1 cancel, so nothing is divided by 0.
     visibility = 1 / ((NoL * (1 - k) + k) * (NoV * (1 - k) + k))
     spec = normal_distribution(xp, NoH, sin2_h, r) * visibility * NoL * 0.25
     facing = (NoL > 0) & (NoV > 0)
+    # Rounding may bring VoH above 1.
     x = xp.maximum(1 - VoH, 0)
     x2 = x * x
     return xp.where(facing, NoL * (1 / xp.pi), 0.0), xp.where(facing, spec, 0.0), x2 * x2 * x
@@ -149,6 +153,7 @@ def specular_chance(xp: Namespace, kd: Any, ks: Any, NoV: Any) -> Any:
     """
     away = xp.maximum(1 - NoV, 0.0)
     fresnel = ks + (1 - ks) * away * away * away * away * away
+    # A black metal that is seen head-on reflects nothing in either lobe.
     share = fresnel / xp.maximum(fresnel + kd, 1e-8)
     return xp.minimum(xp.maximum(share, 0.05), 0.95)
 
@@ -189,6 +194,7 @@ def sample_ggx_half(xp: Namespace, u1: Any, u2: Any, r: Any) -> tuple[Any, Any, 
     """
     r = xp.maximum(r, R_MIN)
     alpha2 = (r * r) * (r * r)
+    # cos^2 and sin^2 are `head` and `tail` over their sum.
     head, tail = xp.maximum(1 - u1, 1e-12), u1 * alpha2
     inverse = 1 / (head + tail)
     cosine, sine, phi = xp.sqrt(head * inverse), xp.sqrt(tail * inverse), 2 * xp.pi * u2

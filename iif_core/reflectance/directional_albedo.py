@@ -24,11 +24,13 @@ def directional_albedo(roughness: np.ndarray) -> np.ndarray:
         (2, J, 33) float64 in [0, 1]; light of radiance L from everywhere is reflected as k_s A_0 L + A_1 L.
     """
     u1, u2 = ((np.indices((STRATA, STRATA)).reshape(2, -1) + 0.5) / STRATA)[:, None, :]
+    # All lobes are 0 at NoV = 0; the first entry stands for a view just above the surface.
     NoV = np.maximum(COSINES, 1e-3)[:, None]
     wo = (np.sqrt(1 - NoV**2), np.zeros_like(NoV), NoV)
     normal = (0.0, 0.0, 1.0)
     out = np.zeros((2, len(roughness), len(COSINES)))
     for j, r in enumerate(roughness):
+        # Drawing by the lobe follows its peak at any roughness, so a fixed number of strata serves all of them.
         wi = brdf.reflect(wo, brdf.sample_ggx_half(NUMPY, u1, u2, r))
         NoL, cosine, NoH, VoH, sin2_h = brdf.half_angles(NUMPY, normal, wi, wo)
         _, spec, fc = brdf.lobes(NUMPY, NoL, cosine, NoH, VoH, sin2_h, r)

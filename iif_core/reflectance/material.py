@@ -54,5 +54,6 @@ def apply_affines(affine: NDArray, object_id: NDArray, base: ArrayLike) -> NDArr
     """
     own = np.broadcast_to(IDENTITY, (len(object_id), NUMBERS))
     if len(affine):
+        # Object -1 reads the last row, which the condition replaces.
         own = np.where((object_id >= 0)[:, None], affine[object_id], IDENTITY)
     return np.clip(unclamped_material(own, np.asarray(base, np.float64)), LOWEST, 1.0)

@@ -89,6 +89,7 @@ def held_out_evidence(
         inside, outside = fold == number, fold != number
         if not (inside.any() and outside.any()):
             return NOTHING
+        # log p of the larger model, then of the simpler one; both scales come from the other fold.
         models = (
             laplace_log_likelihood(r[inside], _scales(np.abs(r[outside]), kind[outside], int(kind.max()) + 1)[kind[inside]])
             for r in (full, simple)
@@ -97,6 +98,7 @@ def held_out_evidence(
     names, row = np.unique(block, return_inverse=True)
     if len(names) < 2:
         return NOTHING
+    # Residuals of a block err together, so a block is one observation (Eq. N.3).
     sums = np.bincount(row, difference)
     return Evidence(float(sums.sum()), float(np.sqrt(len(sums)) * sums.std(ddof=1)), len(difference))
 

@@ -48,6 +48,7 @@ class LightRows:
 def _group_levels(values: np.ndarray, group: np.ndarray, fit: np.ndarray) -> np.ndarray:
     """Return (n,) the median of `values` over the rows in `fit` of the same group; NaN where a group has none."""
     names, row = np.unique(group, return_inverse=True)
+    # Sorted by group and value, the rows of a group are one run. Its middle one, or the two around the middle, give the median.
     order = np.lexsort((values, row))
     order = order[fit[order]]
     count = np.bincount(row[order], minlength=len(names))
@@ -78,16 +79,19 @@ def light_evidence(rows: LightRows, seed: int) -> dict[str, Evidence]:
     fold = folds_of_blocks(rows.block, seed)
     unit = max(float(np.median(rows.radiance)), 1e-30)
     target = np.log(rows.radiance / unit)
+    # In units of the median radiance, as is everything below.
     floor = _DARKEST * max(float(np.mean(rows.known)) / unit, 1.0)
     names = {"full": (True, True), "environment": (True, False), "emitters": (False, True)}
     residual = {name: np.full(n, np.nan) for name in names}
     for number in range(FOLDS):
         fit = fold != number
         best = {name: (np.inf, None) for name in names}
+        # All pairs of strengths. A model with a fixed strength only looks at pairs in which that strength is 0.
         for s in STRENGTHS if rows.saturated.any() else STRENGTHS[:1]:
             for e in STRENGTHS if rows.escaping.any() else STRENGTHS[:1]:
                 light = np.log(np.maximum(rows.known / unit + s * rows.saturated + e * rows.escaping, floor))
                 difference = target - light
+                # Levels come from the rows of the fit alone, and residuals of all rows are kept: the held-out ones are judged.
                 apart = difference - _group_levels(difference, rows.group, fit)
                 loss = np.abs(apart[fit]).mean()
                 for name, (free_s, free_e) in names.items():
@@ -150,6 +154,7 @@ def _view_gains(difference: np.ndarray, view: np.ndarray, count: int, rounds: in
     gain = np.zeros(count)
     for _ in range(rounds):
         rest = difference - (gain[view[:, 1]] - gain[view[:, 0]])
+        # Each pair speaks for both of its photographs, with opposite signs, and each of the two takes half of the difference.
         values, owner = np.concatenate([rest, -rest]), np.concatenate([view[:, 1], view[:, 0]])
         order = np.argsort(owner, kind="stable")
         for part in np.split(order, np.flatnonzero(np.diff(owner[order])) + 1):
@@ -176,6 +181,7 @@ def gloss_evidence(rows: GlossRows, seed: int) -> Evidence:
         fit, held = fold != number, fold == number
         gain = _view_gains(difference[fit], rows.view[fit], int(rows.view.max()) + 1)
         offset = gain[rows.view[:, 1]] - gain[rows.view[:, 0]]
+        # Without a lobe both models agree, so a group that has none adds no evidence.
         matte[held] = apart[held] = difference[held] - offset[held]
         for name in np.unique(rows.group[held]):
             own = rows.group == name

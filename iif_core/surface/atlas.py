@@ -65,7 +65,7 @@ def texel_density(area: ArrayLike, seen_area: ArrayLike, footprint: ArrayLike, e
     """
     area = np.maximum(np.asarray(area, np.float64), 1e-12)
     texel = np.maximum(np.asarray(footprint, np.float64), edge)
-    finest = np.where(np.isfinite(texel), 1 / texel, 1 / (8 * edge))
+    finest = np.where(np.isfinite(texel), 1 / texel, 1 / (8 * edge))  # surface that nobody saw is of one colour
     most = UNSEEN**2 + SEEN_SHARE * finest**2 * np.asarray(seen_area, np.float64)
     return np.minimum(finest, np.sqrt(most / area))
 
@@ -84,6 +84,7 @@ def unwrap(meshes: Sequence[tuple[NDArray, NDArray]], density: ArrayLike, larges
     import xatlas
 
     density = np.asarray(density, np.float64)
+    # First guess: charts fill the share FULL of the largest atlas. Each round that does not fit lowers all densities.
     texels = sum(d * d * face_geometry(*mesh)[1].sum() for mesh, d in zip(meshes, density, strict=True))
     scale = min(1.0, float(largest * np.sqrt(FULL / max(texels, 1e-12))))
     for _ in range(_ROUNDS):
@@ -109,6 +110,7 @@ def unwrap(meshes: Sequence[tuple[NDArray, NDArray]], density: ArrayLike, larges
         new.append(faces.astype(np.int64))
         charts = np.asarray(atlas.get_mesh_vertex_assignment(number)[1]).astype(np.int32)
         coordinates = coordinates[_nearest_with(charts >= 0, meshes[number][0][rows])]
+        # Coordinates of xatlas run over its own width and height; the picture is a square of whole steps.
         uv.append((coordinates * np.array([width / size, height / size])).astype(np.float32))
     return Unwrapped(source, uv, new, size, scale, int(atlas.chart_count))
 
@@ -146,7 +148,7 @@ def texel_surface(uv: ArrayLike, faces: ArrayLike, size: int) -> tuple[NDArray, 
     scene.add_triangles(o3d.core.Tensor(plane), o3d.core.Tensor(np.ascontiguousarray(faces, np.uint32)))
     face, barycentric = np.empty((size, size), np.int32), np.empty((size, size, 3), np.float32)
     column = np.arange(size, dtype=np.float32) + 0.5
-    rows = max(1, (1 << 20) // size)
+    rows = max(1, (1 << 20) // size)  # about a million rays at a time
     for first in range(0, size, rows):
         row = np.arange(first, min(first + rows, size), dtype=np.float32) + 0.5
         rays = np.zeros((len(row), size, 6), np.float32)
@@ -157,6 +159,7 @@ def texel_surface(uv: ArrayLike, faces: ArrayLike, size: int) -> tuple[NDArray, 
         second = np.clip(hit["primitive_uvs"].numpy(), 0, 1)
         here = slice(first, first + len(row))
         face[here] = np.where(found == scene.INVALID_ID, -1, found).astype(np.int32)
+        # Open3D gives the weights of the second and third corner.
         barycentric[here] = np.stack([np.maximum(1 - second.sum(-1), 0), second[..., 0], second[..., 1]], -1)
     return face, barycentric / np.maximum(barycentric.sum(-1, keepdims=True), np.float32(1e-12))
 

@@ -57,6 +57,7 @@ def median_footprint(depths: Iterable[tuple[NDArray, float]]) -> float | None:
 
 def smallest_edge(corners: NDArray) -> float:
     """Return the smallest edge (m) with which voxel indices around the points `corners` (n, 3) fit into a key."""
+    # The origin lies more than an edge below the mesh; 8 voxels of margin cover it and rounding.
     return float(np.ptp(corners, axis=0).max()) / (INDEX_LIMIT - 8)
 
 
@@ -69,6 +70,7 @@ def build_cell_grid(views: Iterable[tuple[NDArray, NDArray]], corners: NDArray, 
     Raises:
         InputError: an edge that is not positive or too small, points that are not finite.
     """
+    # -------- keys, counts and summed points of the cells of each view --------
     origin = grid_origin(corners, edge)
     found = []
     for points, objects in views:
@@ -76,13 +78,14 @@ def build_cell_grid(views: Iterable[tuple[NDArray, NDArray]], corners: NDArray, 
         unique, inverse, count = np.unique(keys, return_inverse=True, return_counts=True)
         sums = np.stack([np.bincount(inverse, points[:, a], len(unique)) for a in range(3)], 1)
         found.append((unique, inverse.astype(np.int32), count, sums))
+    # -------- cells of all views, sorted by key; sums and rows of each view in turn --------
     keys = np.unique(np.concatenate([unique for unique, *_ in found])) if found else np.zeros(0, np.uint64)
     total, summed = np.zeros(len(keys)), np.zeros((len(keys), 3))
     cell_of_pixel = []
     while found:
-        unique, inverse, count, sums = found.pop(0)
+        unique, inverse, count, sums = found.pop(0)  # what was used is freed
         rows = np.searchsorted(keys, unique).astype(np.int32)
-        total[rows] += count
+        total[rows] += count  # keys of one view are distinct, so no row comes twice
         summed[rows] += sums
         cell_of_pixel.append(rows[inverse])
     return CellGrid(edge, origin, keys, (summed / total[:, None]).astype(np.float32)), cell_of_pixel
@@ -107,7 +110,7 @@ class CellValues:
         if not known.all():
             near, around = _rows_of(self._coarse_keys, pack_keys(ijk >> COARSE_SHIFT, objects))
             fallback[around] = self._coarse[near[around]]
-        fallback[known] = self.values[row[known]]
+        fallback[known] = self.values[row[known]]  # last, since the finer value counts
         return fallback, np.where(known, row, -1)
 
 

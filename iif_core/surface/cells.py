@@ -57,6 +57,7 @@ def voxel_indices(points: ArrayLike, edge: float, origin: ArrayLike) -> Array:
     if not np.isfinite(points).all():
         raise InputError("voxel_indices: points contain NaN or infinity; drop rays that miss the mesh first")
     scaled = np.floor((points - np.asarray(origin, np.float32)) * inverse_edge(edge))
+    # Single precision has steps of 128 below 2^31; the cast to int32 would overflow beyond.
     if scaled.size and np.abs(scaled).max() > 2**31 - 256:
         raise InputError(f"voxel edge {edge} m is too small for points {np.abs(points).max()} m from the origin")
     return scaled.astype(np.int32)
@@ -117,7 +118,7 @@ def neighbour_pairs(keys: ArrayLike) -> Array:
     for i, j, k in half:  # the other 13 directions give the same pairs again
         step = np.int64(i) + (np.int64(j) << np.int64(16)) + (np.int64(k) << np.int64(32))
         wanted = keys + step.astype(np.uint64)  # indices lie in 1 ... 65534, so no word overflows into the next
-        row = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
+        row = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))  # the object is part of the key
         hit = np.flatnonzero(keys[row] == wanted) if len(keys) else np.zeros(0, np.intp)
         found.append(np.stack([hit, row[hit]], 1).astype(np.int32))
     return np.concatenate(found)
@@ -125,6 +126,8 @@ def neighbour_pairs(keys: ArrayLike) -> Array:
 
 def hash_words(low, high):
     """Hash the two words of a key to 32 bits, with operations that NumPy and Dr.Jit uint32 arrays share."""
+    # Products carry low bits up and shifts bring high bits down, so neighbouring voxels fall into unrelated slots. All operations
+    # wrap at 32 bits.
     h = (low * 0x85EBCA6B) ^ (high * 0xC2B2AE35)
     h = (h ^ (h >> 15)) * 0x2C1B3C6D
     h = (h ^ (h >> 12)) * 0x297A2D39
@@ -133,7 +136,7 @@ def hash_words(low, high):
 
 def probe_step(h):
     """Compute the odd step between probes from other bits of the hash, so that colliding keys follow different sequences."""
-    return ((h >> 16) ^ (h * _PROBE_STRIDE)) | 1
+    return ((h >> 16) ^ (h * _PROBE_STRIDE)) | 1  # odd: with a power of two for a size, the sequence visits every slot
 
 
 @dataclass(frozen=True)
@@ -160,6 +163,7 @@ class CellTable:
         ordered = np.sort(keys)  # several times as fast as np.unique, which hashes
         if (ordered[1:] == ordered[:-1]).any():
             raise InputError("CellTable.build: keys repeat; merge the rows of one cell first")
+        # At most a quarter of the slots is used, so most lookups end at the first one.
         size = 1 << max(4, int(4 * len(keys) - 1).bit_length() if len(keys) else 4)
         while (table := cls._place(keys, size)) is None:
             size *= 2
@@ -181,7 +185,7 @@ class CellTable:
             if probes == MAX_PROBES:
                 return None
             slot = (h[waiting] + np.uint32(probes) * step[waiting]) & np.uint32(size - 1)
-            free = np.flatnonzero(owner[slot] == EMPTY)[::-1]
+            free = np.flatnonzero(owner[slot] == EMPTY)[::-1]  # highest row first
             owner[slot[free]] = waiting[free]  # the last assignment to a slot wins: the lowest row
             waiting = waiting[owner[slot] != waiting]
             probes += 1
@@ -197,6 +201,7 @@ class CellTable:
         h = hash_words(low, high)
         step = probe_step(h)
         rows = np.full(len(low), -1, np.int32)
+        # Keys are distinct, so at most one probe matches, and the search need not end early.
         for p in range(self.probes):
             entry = self.slots[(h + np.uint32(p) * step) & np.uint32(len(self.slots) - 1)]
             match = (entry[:, 0] == low) & (entry[:, 1] == high) & (entry[:, 2] != EMPTY)

@@ -37,5 +37,6 @@ def closest_points(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) -> 
         found = scene.compute_closest_points(o3d.core.Tensor(points[here]))
         second = found["primitive_uvs"].numpy()
         out.points[here], out.face[here] = found["points"].numpy(), found["primitive_ids"].numpy()
+        # Open3D gives the weights of the second and third corner.
         out.barycentric[here] = np.stack([1 - second.sum(1), second[:, 0], second[:, 1]], 1)
     return out

@@ -42,6 +42,7 @@ def values_at(
     if not len(object_values):
         raise InputError("values_at needs at least one row of object_values: the values of surface nobody saw")
     points, object_id = np.asarray(points, np.float32).reshape(-1, 3), np.asarray(object_id, np.int64).reshape(-1)
+    # -------- the mean of the object, or of all objects; each finer grid then overwrites it where it has a cell --------
     known = (object_id >= 0) & (object_id < len(object_values))
     out = np.where(known[:, None], object_values[np.where(known, object_id, 0)], object_values.mean(axis=0))
     row = np.full(len(points), -1, np.int64)
@@ -52,15 +53,18 @@ def values_at(
         (COARSE * edge, around_ijk, around_object, around),
         (edge, np.asarray(ijk).reshape(-1, 3), np.asarray(cell_object), values),
     )
+    # Scaling by 4 is exact in binary, so a point has the coarse voxel that its fine voxel was averaged into.
     for size, own_ijk, own_object, own in grids:
         table = CellTable.build(pack_keys(own_ijk, own_object))
         row = _rows(table, voxel_indices(points, size, origin), object_id).astype(np.int64)
         out = np.where((row >= 0)[:, None], own[row], out)
+    # `row` is what the last, fine grid found.
     return out, row
 
 
 def _rows(table: CellTable, ijk: Array, object_id: Array) -> Array:
     """Look up voxels of objects; -1 for those that the table lacks, and for indices that no key can hold."""
+    # `pack_keys` refuses what does not fit.
     inside = ((ijk >= 0) & (ijk < 1 << 16)).all(1) & (object_id >= -1) & (object_id < (1 << 16) - 1)
     row = np.full(len(ijk), -1, np.int32)
     row[inside] = table.lookup(pack_keys(ijk[inside], object_id[inside]))

@@ -76,6 +76,7 @@ def interior(object_map: NDArray, border: int) -> NDArray:
         raise InputError(f"border is {border} pixels; it must be 0 or more")
     if border == 0 or object_map.size == 0:
         return object_map >= 0
+    # Minimum and maximum agree where there is one id. Repeating the edge adds no other id, so it is no border (Eq. O.2).
     size = 2 * border + 1
     same = minimum_filter(object_map, size, mode="nearest") == maximum_filter(object_map, size, mode="nearest")
     return same & (object_map >= 0)
@@ -95,6 +96,7 @@ def face_adjacency(faces: NDArray, vertices: NDArray | None = None) -> NDArray:
         return np.zeros((0, 2), np.int32)
     if vertices is not None:
         faces = _welded(np.asarray(vertices), faces)
+    # Sorted by edge, faces that share one stand next to each other.
     key = _edge_keys(faces)
     owner = np.tile(np.arange(len(faces), dtype=np.int32), 3)
     order = np.argsort(key, kind="stable")
@@ -119,18 +121,22 @@ def _welded(vertices: NDArray, faces: NDArray) -> NDArray:
     face that lie within `WELD_ULPS` spacings of the coordinates, which is few of a mesh that is joined already."""
     from scipy.spatial import cKDTree
 
+    # -------- equal positions: each vertex takes the number of the first one there --------
     order = np.lexsort(vertices.T)
     ordered = vertices[order]
     new = np.r_[True, (ordered[1:] != ordered[:-1]).any(1)]
     number = np.empty(len(vertices), np.int64)
     number[order] = order[np.flatnonzero(new)][np.cumsum(new) - 1]
     faces = number[faces]
+    # -------- open edges, and their vertices that almost coincide --------
     _, first, count = np.unique(_edge_keys(faces), return_index=True, return_counts=True)
+    # `_edge_keys` lists the edges v0v1 of all faces first, then v1v2, then v2v0.
     face, side = first[count == 1] % len(faces), first[count == 1] // len(faces)
     loose = np.unique(np.concatenate([faces[face, side], faces[face, (side + 1) % 3]]))
     if not len(loose):
         return faces
     reach = WELD_ULPS * float(np.finfo(np.float32).eps) * float(np.abs(vertices[loose]).max())
+    # Components of these pairs: vertices further apart than `reach` become one through others between them.
     pairs = cKDTree(vertices[loose]).query_pairs(reach, output_type="ndarray")
     _, lowest, part = np.unique(component_labels(len(loose), *pairs.T), return_index=True, return_inverse=True)
     number = np.arange(len(vertices))
@@ -188,6 +194,7 @@ def vote_faces(
     if face.size and face.max() >= n_faces:
         raise InputError(f"face id {face.max()} in a map, but the mesh has {n_faces} faces; map and mesh differ")
 
+    # -------- the winner of each face --------
     span = int(instance.max()) + 1 if instance.size else 1
     pair, count = np.unique(face * span + instance, return_counts=True)
     pair_face, pair_instance = pair // span, pair % span
@@ -197,12 +204,14 @@ def vote_faces(
     label[pair_face[winner]] = pair_instance[winner]
     votes = np.bincount(face, minlength=n_faces)
 
+    # -------- faces without a vote --------
     if faces_adjacency is not None and len(faces_adjacency):
         label = _spread(label, np.asarray(faces_adjacency))
     unreached = label < 0
     background = span if instance.size else 0
     label[unreached] = background
 
+    # -------- agreement: votes for the label of the face over all votes on the object's faces --------
     object_id = np.unique(label)
     column = np.searchsorted(object_id, label)
     pixels = np.bincount(column, votes, len(object_id))
@@ -264,10 +273,11 @@ def partition_agreement(a: NDArray, b: NDArray, weight: NDArray) -> tuple[float,
         raise InputError("partitions without weight cannot be compared")
     table = coo_matrix((weight, (a, b))).tocsr()  # sums entries at the same position
     table = table.tocoo()
-    of_a, of_b = np.bincount(a, weight), np.bincount(b, weight)
+    of_a, of_b = np.bincount(a, weight), np.bincount(b, weight)  # a_i and b_j
     p, q = (of_a**2).sum(), (of_b**2).sum()
     chance = p * q / total**2
     most = 0.5 * (p + q) - chance
+    # If both partitions have a single part, the quotient is 0 / 0; they are equal, hence 1.
     index = ((table.data**2).sum() - chance) / most if most > 1e-12 * total**2 else 1.0
     best = np.where(of_a > 0, 0.0, np.nan)
     union = of_a[table.row] + of_b[table.col] - table.data
@@ -279,6 +289,7 @@ def partition_agreement(a: NDArray, b: NDArray, weight: NDArray) -> tuple[float,
 def _spread(label: NDArray, adjacency: NDArray) -> NDArray:
     """Grow labels over the face graph ring by ring; a face that several labels reach in one ring takes the lowest."""
     n = len(label)
+    # -------- neighbours of face f: ends[start[f] : start[f + 1], 1] --------
     ends = np.concatenate([adjacency, adjacency[:, ::-1]]).astype(np.int64)
     ends = ends[np.argsort(ends[:, 0], kind="stable")]
     start = np.searchsorted(ends[:, 0], np.arange(n + 1))
@@ -286,11 +297,12 @@ def _spread(label: NDArray, adjacency: NDArray) -> NDArray:
     ring = np.flatnonzero(label >= 0)
     unset = np.iinfo(np.int64).max
     while ring.size:
+        # -------- all neighbours of the ring at once, without a loop over its faces --------
         degree = start[ring + 1] - start[ring]
         offset = np.arange(degree.sum()) - np.repeat(np.cumsum(degree) - degree, degree)
         neighbour = ends[np.repeat(start[ring], degree) + offset, 1]
         source = np.repeat(label[ring], degree)
-        fresh = label[neighbour] < 0
+        fresh = label[neighbour] < 0  # labels of earlier rings stay
         neighbour, source = neighbour[fresh], source[fresh]
         ring, column = np.unique(neighbour, return_inverse=True)
         lowest = np.full(len(ring), unset)

@@ -59,6 +59,7 @@ class ShadingCells:
         """(c,) uint32 hash of place, object and normal: what a cell draws does not depend on the other cells
         (docs/method/numerics.md#random-numbers-that-shift)."""
         row, side = np.divmod(self._cells, _BINS)
+        # The side has 125 values and goes into the 7 highest bits of the key, which object ids below 511 leave free.
         mixed = (self._voxels[row] ^ (side.astype(np.uint64) << np.uint64(57))) * np.uint64(0x9E3779B97F4A7C15)
         mixed = (mixed ^ (mixed >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)
         return (mixed >> np.uint64(32)).astype(np.uint32)
@@ -66,6 +67,7 @@ class ShadingCells:
     def find(self, points: ArrayLike, normals: ArrayLike, object_id: ArrayLike) -> Array:
         """Return the cell (n,) int64 of every surface point; raise InputError for a point whose cell does not exist."""
         voxel = pack_keys(voxel_indices(points, self.edge, self.origin), object_id)
+        # A key of voxel and object leaves no room for the side, so the search has two steps.
         row = np.minimum(np.searchsorted(self._voxels, voxel), len(self._voxels) - 1)
         cell = row * _BINS + normal_bin(normals)
         found = np.minimum(np.searchsorted(self._cells, cell), len(self._cells) - 1)
@@ -119,9 +121,10 @@ class ShadingCellBuilder:
         if not self._parts:
             raise InputError("no surface point was added: no view sees the mesh")
         voxel, bins, _, points, normals, object_id, count = self._parts[0]
+        # Rows are sorted by cell, so those of a cell stand together and the first one has its number of pixels.
         voxels, row = np.unique(voxel, return_inverse=True)
         cells, start, members = np.unique(row * _BINS + bins, return_index=True, return_counts=True)
-        choice = start[:, None] + np.arange(REPRESENTATIVES) % members[:, None]
+        choice = start[:, None] + np.arange(REPRESENTATIVES) % members[:, None]  # a cell of few pixels repeats them in turn
         return ShadingCells(
             self.edge, self.origin, object_id[start], points[choice], normals[choice], count[start], voxels, cells
         )
@@ -139,6 +142,7 @@ def _smallest(columns: tuple[Array, ...]) -> tuple[Array, ...]:
     start = np.flatnonzero(first)
     cell = np.cumsum(first) - 1
     pixels = np.bincount(cell, columns[6][order], len(start)).astype(np.int64)
+    # The smallest of a union are among the smallest of its parts, so views can be joined in any order.
     keep = np.arange(len(order)) - start[cell] < REPRESENTATIVES
     count = np.where(first, pixels[cell], 0)[keep]
     order = order[keep]
@@ -188,27 +192,33 @@ def diffuse_of_cells(
     """
     count, number = len(cells), cells.number
     sums, paths = np.zeros((2, count, 3)), np.zeros(count, np.int64)  # paths of one half
+    # each: paths of one half to add; work: cells that get them.
     each, first, work = max(1, samples // 2), None, np.arange(count)
-    owner = cells.object_id.astype(np.int64) + 1
+    owner = cells.object_id.astype(np.int64) + 1  # object -1 is row 0
     turn = 0
     while True:
+        # -------- paths of both halves, from the same points with independent streams --------
         starts = min(REPRESENTATIVES, each)
         a_start = -(-each // starts)
         for half in range(2):
             points, normals = (of[work, :starts].reshape(-1, 3) for of in (cells.points, cells.normals))
+            # A point draws by cell and place in the cell; wraps at 32 bits.
             own = (number[work, None] * np.uint32(REPRESENTATIVES) + np.arange(starts, dtype=np.uint32)).ravel()
+            # Fewer than 64 turns, so no two calls have the same seed.
             traced = trace(points, normals, a_start, (seed * 2 + half) * 64 + turn, own)
-            sums[half, work] += a_start * traced.reshape(len(work), starts, 3).sum(1, dtype=np.float64)
+            sums[half, work] += a_start * traced.reshape(len(work), starts, 3).sum(1, dtype=np.float64)  # `trace` gives means
         paths[work] += starts * a_start
+        # -------- noise of each object (Eq. S.18); those above the limit get as many paths again --------
         diffuse = sums / paths[:, None]
         error = relative_error(diffuse)
         last = float(np.median(error)) if count else 0.0
         first = last if first is None else first
         noisy = _median_by(owner, error) > noise
-        room = (paths * 4 <= max_samples) & noisy[owner]
+        room = (paths * 4 <= max_samples) & noisy[owner]  # paths of both halves after doubling
         if not room.any() or turn == 60:
             break
         work, turn = np.flatnonzero(room), turn + 1
+        # The floor in `relative_error` depends on all cells, so an object can return with fewer paths than others.
         each = int(paths[work].min())
     left = int(np.count_nonzero(noisy[np.unique(owner)]))
     return DiffuseShading(diffuse.astype(np.float32), 2 * paths, first, last, left)

@@ -19,6 +19,7 @@ def clean(faces: NDArray, vertices: NDArray) -> NDArray:
     """Return which faces (m,) bool have an area above `MIN_AREA` and are not the copy of an earlier one, turned or not."""
     keep = face_geometry(vertices, faces)[1] > MIN_AREA
     rows = np.flatnonzero(keep)
+    # Sorted corners are alike for copies and turned copies.
     _, first = np.unique(np.sort(faces[rows], 1), axis=0, return_index=True)
     out = np.zeros(len(faces), bool)
     out[rows[first]] = True

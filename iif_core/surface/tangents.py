@@ -24,6 +24,8 @@ def vertex_tangents(vertices: ArrayLike, faces: ArrayLike, uv: ArrayLike, normal
     faces = np.asarray(faces)
     e1, e2 = (vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2))
     d1, d2 = (uv[faces[:, i]] - uv[faces[:, 0]] for i in (1, 2))
+    # With the edges e_i = d_i,u t + d_i,v b, Cramer's rule gives t and b. Only directions matter, so the sign of the determinant
+    # stands for a division by it.
     determinant = d1[:, 0] * d2[:, 1] - d2[:, 0] * d1[:, 1]
     sign = np.sign(determinant)[:, None]
     along = (d2[:, 1:] * e1 - d1[:, 1:] * e2) * sign  # +u, of a length that goes with area
@@ -37,9 +39,10 @@ def vertex_tangents(vertices: ArrayLike, faces: ArrayLike, uv: ArrayLike, normal
     tangent = total[0] - normals * np.einsum("ij,ij->i", total[0], normals)[:, None]
     norm = np.linalg.norm(tangent, axis=1, keepdims=True)
     smallest = np.eye(3)[np.abs(normals).argmin(1)]
-    some = np.cross(normals, smallest)
+    some = np.cross(normals, smallest)  # the axis farthest from the normal makes a stable perpendicular
     some /= np.maximum(np.linalg.norm(some, axis=1, keepdims=True), 1e-300)
     tangent = np.where(
+        # Below this, what is left of the sum is rounding.
         norm > 1e-9 * np.maximum(np.linalg.norm(total[0], axis=1, keepdims=True), 1e-300),
         tangent / np.maximum(norm, 1e-300),
         some,
@@ -57,6 +60,7 @@ def in_tangent_frame(directions: ArrayLike, normals: ArrayLike, tangents: ArrayL
     """
     directions, normals, tangents = (np.asarray(a, np.float64) for a in (directions, normals, tangents))
     n = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    # Interpolation leaves the frame neither orthogonal nor of unit length.
     t = tangents[:, :3] - n * np.einsum("ij,ij->i", tangents[:, :3], n)[:, None]
     t /= np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
     b = np.cross(n, t) * np.where(tangents[:, 3:] < 0, -1.0, 1.0)

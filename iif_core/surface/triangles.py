@@ -40,6 +40,7 @@ def vertex_normals(vertices: NDArray, faces: NDArray) -> NDArray:
     for i in range(3):
         a = _unit(corner[:, (i + 1) % 3] - corner[:, i])
         b = _unit(corner[:, (i + 2) % 3] - corner[:, i])
+        # Angles do not depend on how a flat surface is cut into triangles; numbers and areas of faces do.
         angle = np.arccos(np.clip(np.einsum("ij,ij->i", a, b), -1, 1))[:, None]
         for c in range(3):
             total[:, c] += np.bincount(faces[:, i], (normal * angle)[:, c], len(vertices))
@@ -66,6 +67,7 @@ def smooth_groups(vertices: NDArray, faces: NDArray, part: NDArray, crease_cosin
         (m,) int32 labels from 0.
     """
     normal = face_geometry(vertices, faces)[0]
+    # Every edge of every face with its lower vertex first, so that both faces list it alike.
     pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
     face = np.repeat(np.arange(len(faces)), 3)
     order = np.lexsort((pairs[:, 1], pairs[:, 0]))
@@ -96,17 +98,17 @@ def subdivide(vertices: NDArray, faces: NDArray, longest: float, max_faces: int)
     parent = np.arange(len(faces))
     if not longest > 0:
         raise InputError(f"subdivision to edges of {longest} m: must be positive")
-    limit = np.inf
+    limit = np.inf  # longest edge allowed in a round
     while True:
         edges, edge_of = _edges(faces)
         length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
         limit = max(longest, min(limit, length.max()) / 2)
-        marked = length > limit * (1 + 1e-9)
+        marked = length > limit * (1 + 1e-9)  # an edge at the limit but for rounding is not split
         if not marked.any():
             if limit <= longest:
                 return vertices, faces, parent
             continue
-        if len(faces) + np.count_nonzero(marked[edge_of]) > max_faces:
+        if len(faces) + np.count_nonzero(marked[edge_of]) > max_faces:  # each split edge adds one triangle to each of its faces
             return vertices, faces, parent
         middle = np.full(len(edges), -1, np.int64)
         middle[marked] = len(vertices) + np.arange(np.count_nonzero(marked))
@@ -147,9 +149,11 @@ def _split(vertices: NDArray, faces: NDArray, middle: NDArray) -> tuple[NDArray,
         order = (first[:, None] + np.arange(3)) % 3
         return np.take_along_axis(faces[rows], order, 1), np.take_along_axis(middle[rows], order, 1)
 
+    # -------- one split edge: two triangles that meet at the opposite corner --------
     one = np.flatnonzero(count == 1)
     v, e = rotated(one, np.argmax(middle[one] >= 0, 1))
     add(one, (v[:, 0], e[:, 0], v[:, 2]), (e[:, 0], v[:, 1], v[:, 2]))
+    # -------- two split edges: the corner between them, and a quadrilateral cut along its shorter diagonal --------
     two = np.flatnonzero(count == 2)
     v, e = rotated(two, (np.argmin(middle[two], 1) + 1) % 3)  # the edge that is not split comes last
     add(two, (e[:, 0], v[:, 1], e[:, 1]))
@@ -158,11 +162,12 @@ def _split(vertices: NDArray, faces: NDArray, middle: NDArray) -> tuple[NDArray,
         a, b, c, d = v[chosen, 0], e[chosen, 0], e[chosen, 1], v[chosen, 2]
         rows = two[chosen]
         add(rows, *(((a, b, c), (a, c, d)) if diagonal else ((a, b, d), (b, c, d))))
+    # -------- three split edges: three corners and the triangle of the midpoints --------
     three = np.flatnonzero(count == 3)
     v, e = faces[three], middle[three]
     inner = [(e[:, 0], v[:, 1], e[:, 1]), (e[:, 2], e[:, 1], v[:, 2]), (e[:, 0], e[:, 1], e[:, 2])]
     add(three, (v[:, 0], e[:, 0], e[:, 2]), *inner)
-    source_rows = np.concatenate(source)
+    source_rows = np.concatenate(source)  # children in the order of their parents
     order = np.argsort(source_rows, kind="stable")
     return np.concatenate(out)[order], source_rows[order]
 

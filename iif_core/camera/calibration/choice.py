@@ -133,6 +133,7 @@ def calibrate_response(
         found.append(views)
     table, best = _compared(families, fits)
     chosen = next(i for i, entry in enumerate(table) if entry["behind"] <= _SIGNIFICANT * entry["error"])
+    # No rounds: the noise under the starting curve alone, for comparison.
     before = maximise(common, response(families[chosen]), np.array(START[families[chosen]]), _SIGMA, 0)
     used = sum(len(channels[c].cell) + len(channels[c].full) for c in enough)
     views = found[chosen]
@@ -204,6 +205,7 @@ def _without_powers(gain: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """(V, 3) gains without the correlation between chroma and exposure (Eq. C.28)."""
     logs = np.log(gain)
     level = logs.mean(1, keepdims=True)
+    # x_v and chi_vc of Eq. C.28. Views that were not estimated take no part: their x is 0.
     chroma, x = logs - level, np.where(seen[:, None], level - level[seen].mean() if seen.any() else 0.0, 0.0)
     return np.exp(level + chroma - x * (x * chroma).sum(0) / max(float((x**2).sum()), 1e-12))
 
@@ -252,6 +254,7 @@ def _fit(family: str, together: Channel, channels: Sequence[Channel], enough: Se
     score, clusters, widths = 0.0, {}, []
     for c in range(3):
         part = slice(c * size, (c + 1) * size)
+        # Too few rows to differ from the common curve; the prior of the difference widens its covariance.
         if c not in enough:
             covariance[part, part] = common.covariance + _CHANNEL_SIGMA**2 * np.eye(size)
             continue
@@ -259,6 +262,7 @@ def _fit(family: str, together: Channel, channels: Sequence[Channel], enough: Se
         params[c], covariance[part, part] = own.params, own.covariance
         score += own.score
         widths.append(own.width)
+        # Channels of one object in one view err together, so they share a cluster.
         for name, value in own.clusters.items():
             clusters[name] = clusters.get(name, 0.0) + value
     return Fitted(

@@ -28,6 +28,7 @@ class _Noise:
 
 def _tables(curve: Response) -> tuple[np.ndarray, np.ndarray]:
     """log x and log dI / d log x at the knots."""
+    # The inverse is tabulated once for all rows; G = dI / d ln x is one over the slope of the table.
     log_x = np.log(curve.inverse(KNOTS))
     return log_x, -np.log(np.maximum(np.gradient(log_x, KNOTS), 1e-12))
 
@@ -46,6 +47,7 @@ def _levels(data: Channel, y: np.ndarray, scale2: np.ndarray, rounds: int = 10) 
     weight = 1.0 / scale2
     for _ in range(rounds):
         level = np.bincount(data.cell, weight * y, size) / np.maximum(np.bincount(data.cell, weight, size), 1e-300)
+        # Student's weights: a row far from the level counts less and less.
         weight = (_FREEDOM + 1.0) / (_FREEDOM * scale2 + (y - level[data.cell]) ** 2)
     return level, weight
 
@@ -126,11 +128,14 @@ def _improve(
 def _widths(data: Channel, noise: _Noise, ratio: np.ndarray) -> _Noise:
     """One step of the fixed point at which the mean of weight x squared deviation is 1, overall and per block."""
     total = max(float(data.share.sum()), 1e-12)
+    # Where the widths are right, weight x deviation^2 is 1 in the mean.
     overall = ratio.sum() / total
     size = len(noise.block)
+    # Small blocks are drawn towards the common width. Steps are limited so that one round cannot run away.
     own = np.bincount(data.block, ratio, size) + _BLOCK_ROWS * overall
     rows = np.bincount(data.block, data.share, size) + _BLOCK_ROWS
     block = noise.block * np.sqrt(np.clip(own / rows / max(overall, 1e-12), 0.1, 10.0))
+    # Relative widths have geometric mean 1; the common width holds the rest.
     block /= np.exp(np.average(np.log(block), weights=rows))
     return _Noise(float(np.clip(noise.width * np.sqrt(np.clip(overall, 0.1, 10.0)), 1e-3, 1.0)), np.clip(block, 0.2, 20.0))
 
@@ -146,17 +151,23 @@ def _inner(
     independence: float,
 ) -> tuple[float, np.ndarray]:
     """Negative log posterior for constant weights, and its gradient."""
+    # -------- curve, inside the range in which it is monotone --------
     inside = curve.with_params(theta)
     log_x, log_gain = _tables(inside)
     dx, dg = _table_slopes(inside, log_x, log_gain)
+
+    # -------- rows about the levels of their patches --------
     y = data.at(log_x) - data.log_e
     size = data.cells
     total = np.maximum(np.bincount(data.cell, weight, size), 1e-300)
     level = np.bincount(data.cell, weight * y, size) / total
     n = y - level[data.cell]
     cost = float((data.share * (0.5 * weight * n**2 + data.at(log_gain))).sum())
+    # The level depends on y too, but drops out: `share` is one number on a patch, where the weighted deviations add up to 0.
     by_x, by_g = data.share * weight * n, data.share
     by_bounds = np.zeros(len(theta))
+
+    # -------- bounds, which act on the curve through the levels and the edge of saturation --------
     if len(data.full):
         edge, edge_slope = np.interp(data.saturation, KNOTS, log_x), _at(dx, data.saturation)
         above = level[data.full] + data.full_e - edge
@@ -165,6 +176,8 @@ def _inner(
         by_level = -1.702 / width * (reached - 0.02) * (1.0 - (reached - 0.02) / 0.98) / reached
         by_bounds -= by_level.sum() * edge_slope
         by_x = by_x + weight * (np.bincount(data.full, by_level, size) / total)[data.cell]
+
+    # -------- gradient, prior, and a penalty on parameters beyond the range --------
     gradient = dx.T @ data.scatter(by_x) + dg.T @ data.scatter(by_g) + by_bounds
     away, beyond = (theta - mean) / deviation**2, theta - inside.params
     cost = independence * cost + 0.5 * float(((theta - mean) * away).sum()) + 1e3 * float((beyond**2).sum())
@@ -194,6 +207,9 @@ def _curvature(
     theta, size = curve.params, curve.params.size
     if not size:
         return np.zeros((0, 0)), 1.0, 0.0
+
+    # -------- H: differences of the gradient, then Student's own curvature --------
+    # An infinite deviation leaves the prior out.
     hessian = np.zeros((size, size))
     for k, step in enumerate(1e-3 * np.eye(size)):
         up = _inner(data, curve, theta + step, weight, noise.width, mean, np.inf, 1.0)[1]
@@ -210,13 +226,20 @@ def _curvature(
     # psi' = w (nu s^2 - n^2) / (nu s^2 + n^2), and nu s^2 + n^2 = (nu + 1) / w.
     excess = weight * 2.0 * n**2 * weight / (_FREEDOM + 1.0)
     hessian = 0.5 * (hessian + hessian.T) - lever.T @ ((data.share * excess)[:, None] * lever)
+    # H has to be positive for the inverses below; noise and Student's tails may make a direction flat or concave.
     values, vectors = np.linalg.eigh(hessian)
     values = np.maximum(values, 1e-6 * max(float(values.max()), 1e-6))
-    # The share (m - 1) / m accounts for the level of the patch.
+
+    # -------- J: scores by cluster --------
+    # The level follows its rows, so n has the share (m - 1) / m of a row's variance. With the root of the share, squared scores
+    # of single rows add up to the variance of sum share w n lever.
     score = np.sqrt(data.share)[:, None] * (weight * n)[:, None] * lever + data.share[:, None] * dg
     owner = np.unique(data.cluster, return_inverse=True)[1]
     summed = np.stack([np.bincount(owner, score[:, k]) for k in range(size)], -1)
+    # The factor corrects for a small number of clusters.
     spread = summed.T @ summed * len(summed) / max(len(summed) - 1, 1)
+
+    # -------- price, independence and sandwich (Eq. C.22, C.23) --------
     prior = np.eye(size) / deviation**2
     known = np.linalg.inv((vectors * values) @ vectors.T + prior)
     price = float(np.trace(known @ spread))
@@ -238,6 +261,7 @@ def _likelihood(data: Channel, curve: Response, noise: _Noise) -> tuple[float, d
     bounds = np.log(
         _saturation_probability(level[data.full] + data.full_e - np.interp(data.saturation, KNOTS, log_x), noise.width)
     )
+    # Sums by cluster, from which families are compared with an error (Eq. C.24).
     names, owner = np.unique(np.concatenate([data.cluster, data.full_cluster]), return_inverse=True)
     summed = np.bincount(owner, np.concatenate([rows, bounds]))
     return float(rows.sum() + bounds.sum()), dict(zip(names.tolist(), summed.tolist(), strict=True))

@@ -58,6 +58,7 @@ class Channel:
     def __post_init__(self) -> None:
         self.knot = np.clip(np.searchsorted(KNOTS, self.value, side="right") - 1, 0, len(KNOTS) - 2)
         self.part = (self.value - KNOTS[self.knot]) / (KNOTS[self.knot + 1] - KNOTS[self.knot])
+        # The level of a patch with m rows uses up one of them (Eq. C.19).
         members = np.bincount(self.cell, minlength=self.cells)
         self.share = (1.0 - 1.0 / np.maximum(members, 1))[self.cell]
 
@@ -96,6 +97,8 @@ def channel_rows(rows: PatchRows, c: int, gains: CameraGains, saturation: float,
     value, clipped = rows.value[:, c], rows.clipped[:, c]
     log_e = log_factor(rows, gains)[:, c]
     use = np.flatnonzero(np.isfinite(value) & (value > MIN_VALUE) & np.isfinite(log_e))
+    # Range of exposures on each patch, in stops. A narrow one says nothing about the curve; a patch that is saturated in all
+    # views has no level.
     owner = np.unique(rows.patch[use], return_inverse=True)[1]
     size = int(owner.max(initial=-1)) + 1
     low, high = np.full(size, np.inf), np.full(size, -np.inf)
@@ -106,6 +109,7 @@ def channel_rows(rows: PatchRows, c: int, gains: CameraGains, saturation: float,
     stops = float(span.max(initial=0.0))
     index = use[_thinned(owner, value[use], clipped[use], kept, budget)[owner]]
     cell = np.unique(rows.patch[index], return_inverse=True)[1]
+    # Rows of one object in one view err together, because gloss brightens the object in that view as a whole.
     cluster = rows.block[index].astype(np.int64) * (len(gains.gain) + 1) + rows.view[index]
     block = np.unique(rows.block[index], return_inverse=True)[1]
     full = clipped[index]
@@ -132,16 +136,20 @@ def _thinned(owner: np.ndarray, value: np.ndarray, clipped: np.ndarray, kept: np
     The few patches near saturation determine the scale of x, so they must not be outnumbered.
     """
     size = int(owner.max(initial=-1)) + 1
+    # Brightest unsaturated value of each patch, by which it falls into one of ten ranges.
     top = np.zeros(size)
     np.maximum.at(top, owner, np.where(clipped, 0.0, value))
     order = kept[np.argsort(np.minimum((10.0 * top[kept]).astype(int), 9), kind="stable")]
     members = np.bincount(owner, minlength=size)
     tenth = np.minimum((10.0 * top[order]).astype(int), 9)
     rows = np.bincount(tenth, members[order], 10)
+    # Ranges with few rows are taken whole, and the others share what is left evenly: `limit` rows each. `room` is that limit if
+    # the k smallest ranges are taken whole.
     level = np.sort(rows)
     room = (budget - np.r_[0.0, np.cumsum(level)[:-1]]) / np.arange(10, 0, -1)
     limit = room[np.argmax(room <= level)] if rows.sum() > budget else np.inf
     share = np.minimum(1.0, limit / np.maximum(rows, 1.0))[tenth]
+    # Within a range every patch has the same share. One is taken whenever the running sum of shares reaches another integer.
     wanted = np.zeros(size, bool)
     wanted[order[np.floor(np.cumsum(share) + 1e-9) > np.floor(np.cumsum(share) - share + 1e-9)]] = True
     return wanted

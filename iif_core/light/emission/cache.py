@@ -37,10 +37,12 @@ class RadianceVoxels:
         radiance (n, 3): of surface at `points` (n, 3), m; points outside voxels that hold bounds are left out.
         """
         own = np.flatnonzero(self.censored)
+        # Voxels are in order of key, so those that hold bounds are too and can be searched.
         keys = pack_keys(self.ijk[own])
         found = pack_keys(voxel_indices(points, self.edge, self.origin))
         at = np.minimum(np.searchsorted(keys, found), max(len(keys) - 1, 0))
         hit = keys[at] == found if len(keys) else np.zeros(len(found), bool)
+        # Mean over the points in a voxel, and no bound is ever lowered.
         count = np.bincount(at[hit], minlength=len(own))
         total = np.stack([np.bincount(at[hit], radiance[hit, c], len(own)) for c in range(3)], 1)
         values = self.radiance.copy()
@@ -135,6 +137,7 @@ class RadianceSums:
         order = np.flatnonzero(row[:, 7])  # bounds are few, and their largest is what counts
         largest = np.zeros((len(self._key), 3))
         np.maximum.at(largest, voxel[order], row[order, 4:7])
+        # `bincount` has added up the bounds as well; their largest takes the place of the sum (Eq. L.6).
         sums[:, 4:7] = largest
         self._value = sums
 

@@ -71,6 +71,7 @@ def face_statistics(
     clear = np.bincount(face[~bounded], minlength=n_faces)
     brightest = value.max(-1) if len(value) else np.zeros(0)
     low, hidden = _censored_quantile(face, brightest, bounded, count, quantile)
+    # Bounds enter the mean only where a face has nothing else.
     used = np.where(bounded & (clear[face] > 0), 0.0, 1.0)
     divisor = np.maximum(np.where(clear > 0, clear, count), 1)
     mean = np.stack([np.bincount(face, value[:, c] * used, n_faces) / divisor for c in range(3)], -1)
@@ -87,15 +88,18 @@ def _censored_quantile(
     order = np.lexsort((bounded, value, face))  # of equal values, bounds come last
     owner, ordered, known = face[order], value[order], ~bounded[order]
     first = np.cumsum(count) - count
+    # N - i + 1 of Eq. L.2: pixels of the face that are at least as bright.
     at_risk = count[owner] - (np.arange(len(owner)) - first[owner])
     # The last observation of a face, if it is not a bound, ends the curve: log 0.
     with np.errstate(divide="ignore"):
         step = np.where(known, np.log1p(-1.0 / np.maximum(at_risk, 1)), 0.0)
     last = at_risk == 1
     finite = np.where(last & known, 0.0, step)
+    # log S as one running sum over the faces in turn, from which the sum over earlier faces is taken off.
     total = np.cumsum(finite)
     before = np.where(first[owner] > 0, total[np.maximum(first[owner] - 1, 0)], 0.0)
     survival = np.where(last & known, 0.0, np.exp(total - before))
+    # The margin keeps rounding of the sums from deciding at the quantile itself.
     reached = known & (survival < 1.0 - quantile - 1e-9)
     hit = np.flatnonzero(reached)
     faces, index = np.unique(owner[hit], return_index=True)
@@ -103,6 +107,7 @@ def _censored_quantile(
     seen = count > 0
     hidden[seen] = True
     hidden[faces] = False
+    # Saturation hides the quantile; the largest value stands for it.
     beyond = np.flatnonzero(hidden)
     low[beyond] = ordered[first[beyond] + count[beyond] - 1] if len(beyond) else 0
     return low, hidden
@@ -131,7 +136,7 @@ def with_thin_objects(
     Returns:
         Statistics of F faces.
     """
-    owner, size = object_id[face] + 1, int(object_id.max(initial=-1)) + 2
+    owner, size = object_id[face] + 1, int(object_id.max(initial=-1)) + 2  # entry 0 is for faces without an object
     share = np.bincount(owner, bright, size) / np.maximum(np.bincount(owner, minlength=size), 1)
     thin = np.bincount(owner, inside, size) < min_observations
     allow = (thin & (share >= 0.9))[object_id + 1] & (object_id >= 0)
@@ -157,6 +162,7 @@ def radiance_threshold(statistics: FaceStatistics, ratio: float = CANDIDATE_RATI
     if not seen.any():
         return float("inf")
     low, weight = statistics.low[seen], statistics.count[seen]
+    # Median over pixels: each face counts as often as it was seen.
     order = np.argsort(low, kind="stable")
     cumulative = np.cumsum(weight[order])
     median = float(low[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])
@@ -198,11 +204,13 @@ def glowing_pieces(
     size = int(piece.max(initial=-1)) + 1
     if not count.any():
         return np.full(len(object_id), -1, np.int32)
+    # Median over pixels: each face counts as often as it was seen.
     order = np.argsort(brightness, kind="stable")
     middle = brightness[order][np.searchsorted(np.cumsum(count[order]), 0.5 * count.sum())]
     threshold = GLOW_RATIO * middle if middle > 0 else np.inf
     seen = np.bincount(piece, count, size)
     bright = np.bincount(piece, np.where(brightness >= threshold, count, 0.0), size)
+    # The median over the pixels of a piece reaches the threshold if half of them do.
     glows = (seen >= min_observations) & (bright >= 0.5 * seen)
     if glows.any():
         glows &= _change_over_views(piece, size, *pixels) <= LARGEST_CHANGE
@@ -213,6 +221,7 @@ def _change_over_views(piece: np.ndarray, size: int, face: np.ndarray, view: np.
     """Return how much the logarithm of the mean of each piece varies over views: standard deviation by pixels, (size,)."""
     good = (face >= 0) & np.isfinite(value)
     views = int(view.max(initial=0)) + 1
+    # One mean for each piece in each view that shows it.
     key = piece[face[good]].astype(np.int64) * views + view[good]
     kinds, at = np.unique(key, return_inverse=True)
     count = np.bincount(at, minlength=len(kinds)).astype(np.float64)
@@ -249,12 +258,16 @@ def emitter_candidates(
     Returns:
         (F,) bool.
     """
+    # -------- bright faces --------
     solid, unseen = areas > 1e-12, statistics.count == 0
     bright = ~unseen & ((statistics.low >= threshold) | statistics.bounded) & solid
     if glowing is not None:
         bright |= (glowing >= 0) & solid
     if not bright.any():
         return bright
+
+    # -------- pools, which reach across a few rings of unseen faces --------
+    # Rings grow over unseen faces only: dark surface that was seen stops them.
     first, second = adjacency[:, 0], adjacency[:, 1]
     reached = bright.copy()
     for _ in range(_BRIDGE):
@@ -263,6 +276,8 @@ def emitter_candidates(
         grown[second[reached[first]]] = True
         reached = bright | (grown & unseen)
     label = components(adjacency, reached)
+
+    # -------- pools that were seen often enough, and what they enclose --------
     pooled = np.bincount(label, np.where(bright, statistics.count, 0))
     candidate = bright & (pooled[label] >= min_observations)
     return candidate | (_enclosed(adjacency, areas, unseen, candidate, label) & solid)
@@ -280,6 +295,7 @@ def _enclosed(
     """Unseen faces in regions that border almost only on candidates and are not much larger than their pools."""
     region = components(adjacency, unseen)
     size = int(region.max(initial=-1)) + 1
+    # Border edges of unseen regions, from the unseen face to the seen one.
     pair = np.concatenate([adjacency, adjacency[:, ::-1]])
     pair = pair[unseen[pair[:, 0]] & ~unseen[pair[:, 1]]]
     border = np.bincount(region[pair[:, 0]], minlength=size)

@@ -211,16 +211,22 @@ def solve_families(
     size = np.bincount(members, minlength=len(number))
     if not len(family) or size.max() == 1:
         return prior.solve(rows)
+
+    # -------- first step: one radiance for each family --------
     initial, correlation = prior.initial, prior.correlation
     joint = np.zeros((len(number), 3))
     np.add.at(joint, members, initial)
     joint /= size[:, None]
+    # Groups of equal radiance act as one group whose column is the sum of theirs.
     matrix = np.zeros((*rows.matrix.shape[:3], len(number), 3), np.float32)
     for group, member in enumerate(members):
         matrix[:, :, :, member] += rows.matrix[:, :, :, group]
     shared = replace(rows, matrix=matrix)
+    # Groups of larger families are not correlated with any other, so the first member can stand for its family.
     of_first = None if correlation is None else correlation[np.ix_(first, first)]
     start = EmissionPrior(joint, prior.width[first], of_first).radiance(shared)[members]
+
+    # -------- second step: every group around the radiance of its family (Eq. L.30) --------
     together = size[members] > 1
     start = np.where(together[:, None], np.maximum(start, 0.1 * initial), initial)
     return solve_emission(rows, start, prior_width=np.where(together, width, prior.width), family=family, correlation=correlation)
@@ -232,18 +238,25 @@ def _censored(difference: np.ndarray, bound: np.ndarray, scale: np.ndarray | Non
     One Newton step on the likelihood of saturation at noise sigma (Tobin 1958; Eq. L.25, L.26). For sigma -> 0 rows below
     their bound count fully and the others not at all.
     """
+    # -------- hard bounds: the limit sigma -> 0, and the first round --------
+    # `difference` is bound - prediction: a row counts while it is positive.
     share, shift = np.ones(len(difference)), np.zeros(len(difference))
     missed = bound & (difference > 0)
     share[bound] = missed[bound]
     if scale is None or noise <= 0:
         return share, shift
+
+    # -------- soft bounds: one Newton step on -log Phi(-z) --------
+    # z > 0 where the prediction is below the bound. From 29 standard deviations on the bound is hard (`far`).
     sigma = noise * scale[bound]
     z = np.clip(difference[bound] / sigma, -30.0, 30.0)
     ratio, excess = hazard(z)
+    # delta = lambda (lambda - z) lies in (0, 1). It falls towards 0 where a bound is met with room to spare; such rows drop out.
     delta = np.clip(ratio * excess, 0.0, 1.0)
     far = np.abs(difference[bound]) >= 29.0 * sigma
     soft = ~far & (delta > 1e-4)
     share[bound] = np.where(far, missed[bound], np.where(soft, delta, 0.0))
+    # Target mu + sigma lambda / delta of Eq. L.26, less the target that the row has already.
     shift[bound] = np.where(soft, sigma * ratio / np.maximum(delta, 1e-4) - difference[bound], 0.0)
     return share, shift
 
@@ -333,9 +346,13 @@ class _ChannelRows:
             a1, a2 = self.first[part].astype(np.float64), self.second[part].astype(np.float64)
             mean = 0.5 * (a1 + a2)
             t1, t2 = self.target[part] + extra, self.target_second[part] + extra
+            # M contains the noise of the traces (Eq. L.23).
             m += mean.T @ (w[:, None] * mean)
             if self.cross:
+                # Every product takes one factor from either trace. Their noise is independent, so it has no part in the
+                # expectation (Eq. L.22).
                 b += 0.5 * (a1.T @ (w * t2) + a2.T @ (w * t1))
+                # The symmetric part is H. The antisymmetric part K is noise alone.
                 product = a1.T @ (w[:, None] * a2)
                 h += 0.5 * (product + product.T)
                 k += 0.5 * (product - product.T)
@@ -355,11 +372,13 @@ class _ChannelRows:
             if not self.cross:
                 a1 = a2 = 0.5 * (a1 + a2)
                 r1 = r2 = 0.5 * (r1 + r2)
+            # Score of a row: one trace times the residual of the other (Eq. L.27).
             parts.append(0.5 * w * (a1 * r2[:, None] + a2 * r1[:, None]))
         single = np.concatenate(parts)
         alone = self.cluster < 0
         number = np.unique(self.cluster[~alone], return_inverse=True)[1]
         shape = int(number.max(initial=-1)) + 1, len(number)
+        # Rows of a cluster may err together, so their scores are added before the outer product.
         together = csr_matrix((np.ones(len(number)), (number, np.arange(len(number)))), shape) @ single[~alone]
         return single[alone].T @ single[alone] + together.T @ together
 
@@ -370,6 +389,7 @@ class _ChannelRows:
 
     def solve(self, max_rounds: int) -> _Channel:
         """Solve and re-weight until the answer rests, then once more with the prior weighed by the design effect."""
+        # -------- start: hard bounds, and no prior --------
         bound, weight, target = self.bound, self.weight, self.mean_target
         mean_a = (0.5 * (self.first + self.second)).astype(np.float64)
         bounded = bool(np.isfinite(self.width).any())
@@ -377,11 +397,15 @@ class _ChannelRows:
         rounds, converged, weighed, noise = 0, False, not bounded, 0.0
         light = mean_a @ answer
         difference = target - light
+        # Variance 0 gives the prior no weight: before the first round there is no residual to weigh it with.
         variance, effect = np.zeros(len(answer)), np.ones(len(answer))
         while rounds < max_rounds and not (converged and weighed):
+            # -------- at rest: weigh the prior by the design effect (Eq. L.28), then carry on --------
             if converged and not weighed:
                 weighed, effect = True, self._design_effect(answer, variance)
                 variance = variance * effect
+
+            # -------- one non-negative least-squares problem --------
             rounds += 1
             before = answer
             share, shift = _censored(difference, bound, self.noise, noise)
@@ -390,14 +414,18 @@ class _ChannelRows:
                 answer, last = self._completed(system.solve(self.initial), system.known), system
             if rounds > _DAMPED_AFTER:  # two answers may alternate: take the one between them
                 answer = 0.5 * (before + answer)
+
+            # -------- weights of the next round --------
             light = mean_a @ answer
             difference = target - light
+            # v: a bound that is met leaves no residual.
             used = np.where(bound & (difference <= 0), 0.0, weight)
             residual = float((used * difference**2).sum() / max(np.count_nonzero(used), 1))
             variance = effect * residual if bounded else variance
             plain = ~bound & (weight > 0)
+            # sigma of Eq. L.26, without the factor nu: weighted root mean square of the residuals of equalities.
             noise = float(np.sqrt((weight[plain] * difference[plain] ** 2).mean())) if plain.any() else 0.0
-            # The first round has no residual to weigh the prior and the bounds with.
+            # The first round does not count: it has neither prior nor soft bounds.
             change = np.abs(answer - before).max(initial=0.0)
             converged = rounds > 1 and bool(change <= 1e-3 * max(answer.max(initial=0.0), 1e-300))
         counted = np.where(bound & (difference < 0), 0.0, weight)
@@ -417,6 +445,7 @@ class _ChannelRows:
         """Groups to which no row responds take what the prior expects of them, given the others (kriging)."""
         if self.correlation is None or known.all() or not np.isfinite(self.width).all():
             return answer
+        # How many standard deviations the known groups lie from their means; the correlation carries this over to the others.
         away = (answer - self.initial)[known] / np.maximum(self.width[known], 1e-300)
         expected = self.correlation[np.ix_(~known, known)] @ np.linalg.solve(self.correlation[np.ix_(known, known)], away)
         out = answer.copy()
@@ -429,6 +458,7 @@ class _ChannelRows:
         system = self.system(self.sure, np.zeros(len(self.target)), variance)
         if system is not None:
             known, inverse = system.known, np.linalg.inv(system.matrix)
+            # Variance by the sandwich, and the one that independent errors of the rows would give.
             real = np.diag(inverse @ self._score_covariance(system, answer) @ inverse)
             claimed = variance[known] * np.diag(inverse)
             effect[known] = np.maximum(np.divide(real, claimed, out=np.ones(len(real)), where=claimed > 0), 1.0)
@@ -447,14 +477,17 @@ class _ChannelRows:
         known, scale, initial = system.known, system.scale, self.initial[system.known]
         inverse = np.linalg.inv(system.matrix)
         response = inverse @ system.lifted  # d answer / d initial
+        # Effect of an error of each initial value on each group, second term of Eq. L.29. The error is at most the value itself.
         prior_part = response * np.minimum(self.width[known], np.maximum(initial, 1e-300)) * scale
         if family is not None:
+            # A common initial value was found from the data, so what moves a whole family alike is no error of the prior.
             member = family[known][:, None] == np.unique(family)
             size = member.sum(0)
             mean = prior_part @ (member / np.maximum(size, 1))
             prior_part = prior_part - np.where(size > 1, mean, 0.0) @ member.T
         data_part = np.clip(np.diag(inverse @ self._score_covariance(system, answer) @ inverse), 0, None)
         share[known] = 1.0 - np.clip(np.diag(response), 0.0, 1.0)
+        # Errors of correlated initial values add up accordingly: diagonal of P C P'.
         related = prior_part if self.correlation is None else prior_part @ self.correlation[np.ix_(known, known)]
         error[known] = np.sqrt(data_part + np.clip((prior_part * related).sum(1), 0, None)) / scale
         return error, share

@@ -110,8 +110,10 @@ class SkySums:
         towards, solid = middles(*self.shape), solid_angles(*self.shape).ravel()
         # Small pictures have few pixels in any texel; a texel counts that has a fiftieth of the most.
         enough = np.clip(0.02 * count.max(), 1, min_pixels)
+        # Parts of a direction: 0 seen unsaturated, 1 mostly saturated, 2 hardly seen or not at all.
         seen, hidden = count >= enough, 2 * saturated > count
         part = np.where(seen, np.where(hidden, 1, 0), 2)
+        # A group is a part of a direction; empty parts get no number.
         number = np.unique(3 * (towards @ _bins().T).argmax(1) + part, return_inverse=True)[1]
         size = int(number.max()) + 1
         known = np.where(seen, count, 0.0)
@@ -147,6 +149,7 @@ def sky_prior(sky: Sky) -> EmissionPrior:
     if sky.sun is not None:
         solid = solid_angles(*sky.columns.shape)[sky.columns == sky.sun].sum()
         apart[sky.sun], width[sky.sun] = True, sun_prior(sky.mean, solid).width[0]
+    # What is saturated, and the sun, say nothing about the rest of the sky, nor the other way round.
     related = correlation(sky.direction)
     related[apart], related[:, apart] = 0.0, 0.0
     np.fill_diagonal(related, 1.0)
@@ -156,6 +159,7 @@ def sky_prior(sky: Sky) -> EmissionPrior:
 def sun_prior(mean: np.ndarray, solid_angle: float) -> EmissionPrior:
     """Return the prior of a sun of `solid_angle` under a sky of mean radiance (3,): it gives `SUN_LIGHT` times the light of the
     sky, or less."""
+    # Irradiance is pi x radiance from a whole sky of one radiance, and solid angle x radiance from a sun overhead.
     return EmissionPrior(mean[None], np.array([SUN_LIGHT * np.pi / solid_angle]))
 
 

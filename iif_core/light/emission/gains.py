@@ -117,6 +117,7 @@ def estimate_object_gains(
     # Objects without rows all get the same gains, so one of them is enough; a scan has many.
     has_rows = np.bincount(owner[owner >= 0], minlength=count) > 0
     asked = np.r_[np.flatnonzero(has_rows), np.flatnonzero(~has_rows)[:1]]
+    # Objects without rows share the last place. The extra entry at the end sends the owner -1 to itself.
     number = np.full(count + 1, len(asked) - 1)
     number[asked], number[-1] = np.arange(len(asked)), -1
     if albedo is not None:
@@ -143,26 +144,35 @@ def _gains_of_asked(
     column = np.where(known, owner, count)
     of_objects = _ObjectRows(rows, column, count + 1, scale_is_identifiable, options)
     weight, gloss_weight = rows.weight, np.zeros(count)
+    # Weights w y^2 of the mean of log g, for light whose level is the prior's.
     share = _by_object(np.where(rows.lower_bound, 0.0, weight) * rows.observed**2, column, count + 1)[:count]
     for _ in range(options.rounds):
+        # -------- E under the present gains --------
         of_row, gloss_of_row = np.concatenate([gain, np.ones((1, 3))])[column], np.append(gloss_gain, 1.0)[column]
         scaled = replace(rows, weight=weight).scaled(of_row, gloss_of_row)
         radiance, light = prior.radiance_and_light(scaled, max_rounds=5)
         predicted = light + scaled.cached.sum(1).mean(0)
+
+        # -------- weights relative to the prediction (Eq. L.39) --------
         weight = _relative_to(rows, predicted, known)
         used = np.where(rows.lower_bound, 0.0, weight)
         if rows.has_lobes:  # mean weighted square of what an object's rows leave unexplained
             left = _by_object(used * (rows.observed - predicted) ** 2, column, count + 1)[:count].sum(1)
             gloss_weight = GLOSS_PRIOR_ROWS * left / np.maximum(np.bincount(column, (used > 0).sum(1), count + 1)[:count], 1)
+
+        # -------- level, gains and gloss in closed form (Eq. L.35 to L.38) --------
         moments = of_objects.moments(used, gloss_weight, radiance)
         level = _find_level(moments, column, albedo) if scale_is_identifiable else _Level(np.zeros(3))
         new, gloss_gain = moments.gains(level.log_level)
         if not scale_is_identifiable:
+            # The level is the prior's, so gains do not move it: the mean of log g stays 0.
             new /= np.exp((share * np.log(new)).sum(0) / np.maximum(share.sum(0), 1e-300))
         done = np.abs(np.log(new / gain)).max() < 1e-3
         gain = new
         if done:
             break
+
+    # -------- errors of the level (Eq. L.45, L.46) --------
     errors = float("inf"), np.full((rows.groups, 3), np.inf)
     if scale_is_identifiable:
         errors = _level_errors(of_objects, weight, gloss_weight, radiance)
@@ -180,15 +190,23 @@ def _level_errors(
     """
     rows = of_objects.rows
     anchor = of_objects.column == of_objects.count - 1
+
+    # -------- e_free: the level of light that no row shows unsaturated --------
+    # The jackknife over objects leaves anchors and bounds out.
     seen = _seen_unsaturated(rows, weight, anchor)
     used = np.where(anchor[:, None] | rows.lower_bound, 0.0, weight)
     free, shown = (np.where(which, radiance, 0.0) for which in (~seen, seen))
     free_error = of_objects.moments(used, gloss_weight, free, known=shown).level_error()
     if not seen.any():
         return free_error, np.full(seen.shape, free_error)
+
+    # -------- chi: how much of the light on the rows comes from emitters that are seen --------
     mean = rows.matrices.mean(0)
     size = [float((used * rows.observed * light_of(mean, e)).sum()) for e in (free, shown)]
     phi = float(np.clip(size[1] / max(sum(size), 1e-300), 0.0, 1.0)) if size[1] > 0 else 0.0
+
+    # -------- e_seen: do the objects agree with what is seen of the emitters? --------
+    # `log_level` is the level that the objects alone would give to all light; 0 is agreement.
     everything = of_objects.moments(used, gloss_weight, radiance)
     error = everything.level_error()
     log_level = float(_lowest(everything.costs().sum(2).sum(1)[:, None])[0])
@@ -253,6 +271,7 @@ def _colour_shift(moments: _Moments, level: np.ndarray, base: np.ndarray, rows: 
     shift = first
     for _ in range(_COLOUR_STEPS):  # the share is not the same everywhere
         moved = np.abs(shift) > 1e-9
+        # q as a quotient of differences: by how much this shift changes the cast.
         share = np.where(moved, (first - cast(shift)) / np.where(moved, shift, 1.0), 1.0).clip(0.0, 1.0)
         shift = share * first * square / (share**2 * square + BASE_COLOUR_ERROR**2)
         shift = shift - shift.mean()
@@ -303,6 +322,8 @@ class _ObjectRows:
         def seen(a: _Traces) -> np.ndarray:
             return sums(self.rows.observed * 0.5 * (a[0] + a[1]))
 
+        # The light is x = s d + h in the albedo lobe and z = s e + k in the gloss. Products of two such sums are polynomials of
+        # second degree in s, so their coefficients are summed once for all levels.
         d, h = lobe(0)
         zero = np.zeros((self.count, 3))
         gloss = _Linear(zero, zero), _Quadratic(zero, zero, zero), _Quadratic(zero, zero, zero)
@@ -383,6 +404,7 @@ class _Moments:
         """(cost, g, t) of all but the last object, at log s (..., 1 or 3): (..., O, 3) twice and (..., O); Eq. L.34 to L.37."""
         yx, yz, xx, xz, zz = (part[..., :-1, :] for part in self._at(log_level))
         xx, zz = np.maximum(xx, 0.0), np.maximum(zz, 0.0)
+        # A billionth of the largest moment gives the common gain to objects without rows, whose own moments are 0.
         floor = 1e-9 * np.maximum(xx.max((-2, -1), keepdims=True), 1e-300)
         prior = self.shrinkage * xx + floor  # weight of the common gain
 
@@ -391,6 +413,7 @@ class _Moments:
             return np.clip((total + floor) / (below + floor), *GAIN_BOUNDS) if self.scale_is_identifiable else 1.0
 
         t, gloss_prior = np.ones(xx.shape[:-1]), 0.0
+        # Gloss as predicted (t = 1) while t is eliminated; again below with the gloss that was found.
         common = common_gain(t)
         if self.gloss_weight is not None:
             # g eliminated, then t; noise may make the information about t negative, which then counts as none.
@@ -403,12 +426,14 @@ class _Moments:
         gain = np.clip((yx - of_all * xz + prior * common) / (xx + prior), *GAIN_BOUNDS)
         cost = self.observed_squared[:-1] - 2 * gain * yx - 2 * of_all * yz + gain**2 * xx
         cost = cost + 2 * gain * of_all * xz + of_all**2 * zz
+        # The level is found channel by channel, so each channel carries a third of the term in t.
         cost = cost + prior * (gain - common) ** 2 + (gloss_prior * (t - 1) ** 2)[..., None] / 3
         return cost, gain, t
 
     def costs(self) -> np.ndarray:
         """(levels, O + 1, 3)."""
         yx, yz, xx, xz, zz = (part[:, -1:] for part in self._at(LOG_LEVELS[:, None]))
+        # sum w (y - x - z)^2: anchors have g = t = 1.
         anchors = self.observed_squared[-1:] - 2 * yx - 2 * yz + xx + 2 * xz + zz
         return np.concatenate([self._solve(LOG_LEVELS[:, None])[0], anchors], 1)
 
@@ -424,7 +449,9 @@ class _Moments:
         if n < 2:
             return np.zeros(3)
         whole = costs.sum(1)
+        # Costs add up over objects, so leaving one out is a subtraction and needs no further solve.
         left_out = np.moveaxis(whole[:, None] - costs[:, :-1][:, has_rows], 2, 0)  # (3, levels, n)
+        # What all channels do together is an error of the level and none of its colour.
         of_all = _lowest(left_out.sum(0)) - _lowest(whole.sum(1)[:, None])
         moved = np.stack([_lowest(own) for own in left_out]) - _lowest(whole)[:, None] - of_all
         at = left_out.argmin(1)

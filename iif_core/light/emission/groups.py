@@ -48,7 +48,7 @@ class EmitterGroups:
 
     def select(self, kept: np.ndarray) -> EmitterGroups:
         """The groups of a mask (G,), renumbered."""
-        number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1).astype(np.int32)
+        number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1).astype(np.int32)  # the last is for -1, no group
         of_face = number[self.of_face]
         side = np.where(of_face >= 0, self.side, 0).astype(np.int32)
         rows = (self.faces[kept], self.area[kept], self.observed[kept], self.count[kept])
@@ -110,6 +110,7 @@ def group_emitters(
     side = _sides(candidate, statistics)
     pair = adjacency[candidate[adjacency[:, 0]] & candidate[adjacency[:, 1]]]
     pair = pair[side[pair[:, 0]] == side[pair[:, 1]]]
+    # Candidates are numbered from 0 in what follows.
     local = np.full(len(candidate), -1, np.int64)
     local[ids] = np.arange(len(ids))
     label = components(local[pair], np.ones(len(ids), bool)) if len(ids) else np.zeros(0, np.int64)
@@ -122,6 +123,7 @@ def group_emitters(
     parent = _merge(local[pair], normals[ids], areas[ids], colour, weight, small, *limits)
     label = np.unique(parent, return_inverse=True)[1] if len(ids) else np.zeros(0, np.int64)
     if glowing is not None and (glowing[ids] >= 0).any():
+        # One number for each piece and side.
         label = _joined(label, np.where(glowing[ids] >= 0, 3 * glowing[ids].astype(np.int64) + side[ids] + 1, -1))
     return _strongest(ids, label, side, statistics, areas, options)
 
@@ -130,6 +132,7 @@ def _joined(label: np.ndarray, piece: np.ndarray) -> np.ndarray:
     """Join groups, (n,) from 0, that have faces of the same piece, (n,) >= 0, -1 = of none; returns labels from 0."""
     inside = np.flatnonzero(piece >= 0)
     size = int(label.max()) + 1
+    # Groups and pieces are the nodes of one graph, in which each face links its group to its piece.
     node = size + np.unique(piece[inside], return_inverse=True)[1]
     joined = component_labels(int(node.max()) + 1, label[inside], node)
     return np.unique(joined[label], return_inverse=True)[1]
@@ -162,6 +165,7 @@ def _strongest(
     observed = np.stack([np.bincount(label, statistics.mean[ids, c] * statistics.count[ids]) for c in range(3)], -1)
     observed = observed / np.maximum(pixels, 1)[:, None]
     solid = ((count >= options.min_faces) | (area >= options.min_area)) & (pixels >= options.min_observations)
+    # By power, the strongest first; ties by number.
     order = np.lexsort((np.arange(len(count)), -area * observed.sum(-1)))
     kept = np.array([g for g in order if solid[g]][: options.max_groups], np.int64)
     reasons = np.where(solid, f"not among the {options.max_groups} strongest", "too small or hardly seen")
@@ -200,12 +204,14 @@ def _merge(
     area_sum = areas.astype(np.float64).copy()
 
     def root(i: int) -> int:
+        # Path halving keeps the trees flat.
         while parent[i] != i:
             parent[i] = parent[parent[i]]
             i = parent[i]
         return i
 
     def ratio(i: int, j: int) -> float:
+        # A group that is always saturated has no colour to compare and passes.
         if weight_sum[i] == 0 or weight_sum[j] == 0:
             return 1.0
         a, b = colour_sum[i] / weight_sum[i] + 1e-6, colour_sum[j] / weight_sum[j] + 1e-6
@@ -217,16 +223,21 @@ def _merge(
         for total in (normal_sum, colour_sum, weight_sum, area_sum):
             total[i] += total[j]
 
+    # -------- greedy merging, the most similar neighbours first --------
+    # Ratios are taken anew from whole groups before each merge, so a gradient is cut into steps.
     first = np.array([ratio(i, j) for i, j in pair]) if len(pair) else np.zeros(0)
     for e in np.argsort(first, kind="stable"):
         i, j = root(int(pair[e, 0])), root(int(pair[e, 1]))
         if i == j or ratio(i, j) >= max_ratio:
             continue
+        # All faces of a connected piece have the same entry in `small`, so the root's entry holds for the group.
         if not small[i]:
             a, b = normal_sum[i], normal_sum[j]
             if a @ b < min_cosine * np.sqrt((a @ a) * (b @ b)):
                 continue
         join(i, j)
+
+    # -------- rims of saturated panels --------
     # A photograph that is saturated on lamp and rim alike cannot say that the rim only reflects. Groups are whole by now: the
     # smallest is joined to its largest neighbour first.
     seen_clear, area = weight_sum > 0, area_sum.copy()

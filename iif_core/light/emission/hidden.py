@@ -36,7 +36,7 @@ def with_hidden_surface(
     Returns:
         The groups. Those that were appended shine to both sides and have `count` 0.
     """
-    known = np.zeros(int(object_id.max(initial=-1)) + 2, bool)
+    known = np.zeros(int(object_id.max(initial=-1)) + 2, bool)  # the last entry is read by faces without an object, -1
     known[object_id[seen | (groups.of_face >= 0)]] = True
     face = np.flatnonzero(~known[object_id] & (object_id >= 0) & (areas > 1e-12))
     if not len(face):

@@ -48,6 +48,9 @@ class NormalSystem:
         from scipy.linalg import solve_triangular
         from scipy.optimize import nnls
 
+        # Minimising x'Qx - 2 c'x over x >= 0 is the least-squares problem |L'x - L^-1 c|^2 with Q = L L', which is the form that
+        # the solver of Lawson and Hanson takes. Q has a Cholesky factor because `_definite` lifts what is not positive. c is the
+        # right-hand side of Eq. L.24.
         lower = np.linalg.cholesky(self.matrix)
         right = solve_triangular(lower, self.right + self.lifted @ (initial[self.known] * self.scale), lower=True)
         answer = initial.copy()
@@ -70,14 +73,17 @@ def normal_system(
     Returns:
         The system, or None when no row responds to any group.
     """
+    # A column to which no row responds has no curvature; its group stays out of the system.
     diagonal = np.diag(normal.m)
     known = diagonal > 1e-12 * max(diagonal.max(), 1e-300)
     if not known.any():
         return None
+    # In units of unit diagonal, groups that light many rows and groups that light few are comparable, and one ridge suits all.
     scale = np.sqrt(diagonal[known])
     unit, pick = np.outer(scale, scale), np.ix_(known, known)
     scaled = NormalSums(normal.h[pick] / unit, normal.k[pick] / unit, normal.m[pick] / unit, normal.b[known] / scale)
     matrix, lifted = _definite(scaled, ridge)
+    # Root of v_g / sigma_g^2 in these units. It is 0 for an infinite width.
     each = np.sqrt(variance[known]) / (width[known] * scale)
     prior = np.diag(each**2)
     if correlation is not None:
@@ -87,11 +93,15 @@ def normal_system(
 
 def _definite(normal: NormalSums, ridge: float) -> tuple[np.ndarray, np.ndarray]:
     """(H lifted, the lift), in units in which the diagonal of M is 1 (Eq. L.24)."""
+    # M^(1/2) and M^(-1/2). The floor on the eigenvalues keeps the latter finite where columns are alike and M is singular.
     values, vectors = np.linalg.eigh(normal.m)
     values = np.maximum(values, 1e-9 * values[-1])
     root, inverse = (vectors * np.sqrt(values)) @ vectors.T, (vectors / np.sqrt(values)) @ vectors.T
+    # Reliabilities rho_j, at most 1 because M - H is positive semidefinite (Eq. L.23), and their directions u_j.
     share, directions = np.linalg.eigh(inverse @ normal.h @ inverse)
+    # nu: the expectation of K is 0, so its spectral norm shows how much noise alone moves a reliability.
     noise = float(np.linalg.norm(inverse @ normal.k @ inverse, 2)) if normal.k.any() else 0.0
+    # A lifted direction has the curvature of M, of which the lifted part belongs to the initial value.
     lift = np.where(share < max(TRUSTED_RELIABILITY * noise, 1e-6), 1.0 - share, 0.0)
     whole = root @ directions
     lifted = (whole * lift) @ whole.T + ridge * np.eye(len(values))

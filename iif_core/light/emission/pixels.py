@@ -55,6 +55,7 @@ class EmissionPixels:
         """(n,) share of each pixel in which it sees the group of its middle; 1 for pixels that look at none."""
         if self.coverage is None or not self.coverage.shape[1]:
             return np.ones(len(self.group))
+        # -1 reads column 0, which the last line replaces by 1.
         own = np.take_along_axis(self.coverage, np.maximum(self.group, 0)[:, None], 1)[:, 0]
         return np.where(self.group >= 0, own, 1.0)
 

@@ -54,7 +54,9 @@ class EmissionProblem:
         mean = 0.5 * (predicted[0] + predicted[1])
         floor = ROW_FLOOR * float(np.median(observed.mean(1))) if len(observed) else 1.0
         scale = np.maximum(0.5 * (observed + np.abs(mean)) + floor, 1e-300)
+        # The two traces have independent noise, so it has no part in the expectation of the product.
         error = (observed - predicted[0]) / scale * ((observed - predicted[1]) / scale)
+        # A bound that is met speaks neither for nor against the light.
         error = np.where(bound & (mean > observed), 0.0, error).mean(1)
         return float((self.pixels[used] * error).sum() / max(self.pixels[used].sum(), 1e-300))
 
@@ -121,6 +123,9 @@ def assemble(
     Returns:
         The problem, rows of the sky last.
     """
+    # -------- what a pixel on an emitter shows --------
+    # It shows phi E, with phi the share of the pixel in which it sees each group (n, G, 3), and no traced light. In a trial it
+    # may also show what a white surface would reflect.
     own = pixels.group >= 0
     direct = np.repeat(pixels.direct(n_groups)[:, :, None], 3, 2)
     matrix, cached = np.array(transport.matrix), np.array(transport.cached, np.float64)
@@ -128,16 +133,23 @@ def assemble(
     observed = np.array(pixels.radiance, np.float64)
     if white is not None:
         matrix[:, :1, own], cached[:, :1, own] = white.matrix, white.cached
+
+    # -------- pixels that only bound the emission (Eq. L.16, L.18) --------
+    # In a trial every pixel on an emitter does; afterwards only one that the emitter fills in part.
     bounded = pixels.partial if white is None else own
     bound = pixels.bound | bounded[:, None]
+    # Unsaturated ones have an upper end too, phi E <= y, which is the lower bound -phi E >= -y.
     clear = bounded & ~pixels.bound.any(1)
     top = -observed[clear]
     partial = pixels.partial
+    # Shares are counted on few rays. Each end takes them with the error that makes the bound weaker.
     least = np.where(partial[:, None, None], np.maximum(direct - COVERAGE_ERROR, 0.0), direct)
     most = np.where((direct > 0) & partial[:, None, None], np.minimum(direct + COVERAGE_ERROR, 1.0), direct)
     matrix[:, 0] += most
     if white is None:  # what shares a pixel with an emitter is dimmer than `rest`
         observed -= np.where(partial, pixels.rest * (1.0 - least[:, :, 0].sum(1)), 0.0)[:, None]
+
+    # -------- one row for each owner, group, view and tile --------
     key = np.stack([np.where(own, -1, pixels.object_id), pixels.group, pixels.view, pixels.tile], 1)
     if clear.any():  # the upper ends, as bounds of the negated rows
         upper = np.zeros((*matrix.shape[:2], int(clear.sum()), n_groups, 3), matrix.dtype)
@@ -145,6 +157,7 @@ def assemble(
         none = np.zeros((*upper.shape[:3], 3), upper.dtype)
         matrix, cached = np.concatenate([matrix, upper], 2), np.concatenate([cached, none], 2)
         observed, bound = np.r_[observed, top], np.r_[bound, np.ones((int(clear.sum()), 3), bool)]
+        # Negative tiles keep upper ends from being averaged with lower ends.
         key = np.r_[key, key[clear] * [1, 1, 1, -1] - [0, 0, 0, 1]]
     problem, _ = _averaged(EmissionRows(matrix, observed, cached, np.ones(observed.shape), bound), key)
     if sky is not None and sky.pixels.any():
@@ -169,7 +182,7 @@ def _averaged(rows: EmissionRows, key: np.ndarray) -> tuple[EmissionProblem, np.
     """Averages of rows with the same key (owner, group, view, tile), weighted for relative noise; and a row that each is of."""
     keys, block = np.unique(key, axis=0, return_inverse=True)
     rows, pixel = block_rows(rows, block.ravel())
-    key, pixels = key[pixel], rows.weight[:, 0]
+    key, pixels = key[pixel], rows.weight[:, 0]  # all weights were 1, so their sum is a number of pixels
     brightness = np.abs(rows.observed).mean(1, keepdims=True)
     for g in np.unique(key[key[:, 1] >= 0, 1]):  # one weight for all that is seen of a group, or its dark edges count most
         own = key[:, 1] == g
@@ -179,6 +192,7 @@ def _averaged(rows: EmissionRows, key: np.ndarray) -> tuple[EmissionProblem, np.
     owner = key[:, 0].astype(np.int64)
     # What an emitter shows itself has next to no noise.
     noise = np.where(owner >= 0, 1.0, 1e-3) * scale[:, 0]
+    # Rows of one object in one view share the error of its albedo. Anchors are independent of each other.
     cluster = np.where(owner >= 0, owner * (int(key[:, 2].max(initial=0)) + 1) + key[:, 2], -1)
     rows = replace(rows, weight=rows.weight / scale**2, cluster=cluster, noise=noise)
     return EmissionProblem(rows, owner, key[:, 1] >= 0, pixels), pixel
@@ -189,6 +203,7 @@ def _with_sky(problem: EmissionProblem, n_groups: int, sky: Sky) -> EmissionProb
     known = np.flatnonzero(sky.pixels > 0)
     count, old, seen = len(known), problem.rows, sky.radiance[known]
     matrix = np.zeros((*old.matrix.shape[:2], count, n_groups, 3), np.float32)
+    # Camera rays see the group itself: A = 1 in its own column, and h = 0.
     matrix[:, 0, np.arange(count), n_groups - sky.size + known] = 1.0
     level = np.maximum(seen.mean(1), 1e-6)
     rows = EmissionRows(
@@ -210,6 +225,7 @@ def _strengthened(rows: EmissionRows, anchor: np.ndarray) -> EmissionRows:
         return rows
     first, second = rows.matrices
     mean = 0.5 * (first + second)
+    # Numerator of Eq. L.17 without the factor, (G, 3): what the light of each group does in rows that are no anchors.
     elsewhere = np.einsum("nc,ngc->gc", np.where(anchor[:, None], 0.0, rows.weight), mean.astype(np.float64) ** 2)
     group = mean[anchor].max(2).argmax(1)
     weight = rows.weight.copy()

@@ -56,6 +56,7 @@ class WhiteSurface:
     def excess(self, radiance: np.ndarray) -> np.ndarray:
         """Return (G,) brightness of each group relative to the white surface under the light of the others (Eq. L.31); infinite
         without light, 0 where the group was not seen."""
+        # A group does not light itself.
         others = self.matrix * (1.0 - np.eye(len(self.seen)))[:, :, None]
         white = (np.einsum("ghc,hc->gc", others, radiance) + self.cached).sum(1)
         seen = self.shown(radiance).sum(1)
@@ -115,23 +116,31 @@ def prune_groups(
     possible = np.bincount(members, _light_shares(rows, white.seen, elsewhere))[members]
     radiance = prior.radiance(rows, _TRIAL_ROUNDS)
     while True:
+        # -------- which groups are open to doubt --------
         emission = radiance.sum(1)
         power = np.bincount(members, _light_shares(rows, radiance, elsewhere))[members]
+        # A dropped group lights the scene with what was seen of it.
         shown = np.where(kept[:, None], radiance, white.seen)
         excess = np.where(kept, white.excess(shown), excess)
         dark = kept & ~protected & (emission <= 0)
         open_ = kept & ~protected & ~dark & ~missed
         reflecting, weak = open_ & (excess < certain), open_ & (power < share)
+
+        # -------- which of them to try --------
         if dark.any():
             drop = dark
         elif reflecting.any():
+            # The least credible first: the light of a false emitter makes its neighbours look like reflectors.
             drop = reflecting & (excess <= 1.1 * excess[reflecting].min())
         elif weak.any():
             drop = weak
         else:
             break
         if singly and not dark.any():
+            # One by one, the weakest first.
             drop &= power <= power[drop].min()
+
+        # -------- solve without them, and drop them unless they are missed (Eq. L.32) --------
         trial = _solve_subset(rows, prior, kept & ~drop, white.seen)
         before = _misfit(rows, shown, elsewhere)
         after = _misfit(rows, np.where((kept & ~drop)[:, None], trial, white.seen), elsewhere)
@@ -199,5 +208,6 @@ def insignificant(
     """
     own = np.sqrt(np.maximum(error**2 - (level_error * radiance) ** 2, 0.0))
     member = np.unique(family, return_inverse=True)[1]
+    # Sums over the groups of a family and the channels, in units of power up to the factor pi.
     power, spread = (np.bincount(member, area * values.sum(1)) for values in (radiance, own))
     return (power < SIGNIFICANT * spread)[member] if len(member) else np.zeros(0, bool)

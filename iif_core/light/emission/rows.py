@@ -127,6 +127,7 @@ def light_of(matrix: np.ndarray, radiance: np.ndarray) -> np.ndarray:
     One matrix product over groups and channels; `einsum` with the channels innermost takes up to four times as long.
     """
     groups = matrix.shape[-2]
+    # (3 G, 3): column c holds E of channel c in the rows of that channel and 0 elsewhere, so one product serves all channels.
     spread = np.zeros((groups, 3, 3))
     spread[:, range(3), range(3)] = radiance
     spread, flat = spread.reshape(3 * groups, 3), matrix.reshape(int(np.prod(matrix.shape[:-2])), 3 * groups)
@@ -147,11 +148,13 @@ def block_rows(rows: EmissionRows, block: np.ndarray) -> tuple[EmissionRows, np.
     """
     if not len(block):
         return rows, np.zeros(0, np.int64)
+    # Three bits for the channels that are bounds: only rows with the same pattern are averaged.
     code = rows.lower_bound @ np.array([1, 2, 4])
     order = np.lexsort((code, block))
     key = np.asarray(block, np.int64)[order] * 8 + code[order]
     starts = np.flatnonzero(np.r_[True, np.diff(key) != 0])
     size = np.diff(np.r_[starts, len(key)])
+    # Sorted rows of a block are neighbours, so sums over blocks are sums between `starts`.
     omega = rows.weight[order].astype(np.float64)
     total = np.add.reduceat(omega, starts, 0)
     # A block whose weights are all 0 keeps weight 0; its mean is then a plain one.

@@ -117,6 +117,7 @@ class Candidates:
         """Misfit of the families; the problem with all columns, scaled by the gains, in which their light is cached; and (n, 3)
         what white surface would show in the place of the pixels of all groups."""
         keep = np.isin(self.family, [*chosen, -1])
+        # Pixels on groups that do not shine are rows like any others: light that falls on them must explain how bright they are.
         every = self.problem.beside(self.reflecting.take(~keep[self.of_group]))
         part, prior = every.columns(keep, self.shown), self.prior.only(keep)
         solved, gains = part.solve_object_gains(prior, self.albedo, len(self.albedo.mean), QUICK)
@@ -166,9 +167,11 @@ def decrease(lit: EmissionProblem, column: np.ndarray) -> float:
     The gains of objects follow: what the column has in common with the light that an object receives already changes nothing.
     """
     rows, used = lit.rows, ~lit.anchor
+    # The light of the chosen families is in `cached`, so a target is what they leave unexplained.
     residual, owner = rows.mean_target[used], lit.owner[used]
     predicted = np.maximum(rows.observed[used] - residual, 0.0)
     scale = 0.5 * (rows.observed[used] + predicted) + ROW_FLOOR * np.median(rows.observed[used].mean(1))
+    # A bound that is met does not count.
     counts = (scale > 0) & ~(rows.lower_bound[used] & (residual < 0))
     weight = np.divide(lit.pixels[used, None], scale**2, out=np.zeros(scale.shape), where=counts & (scale**2 > 0))
     first, second = column[:, used]
@@ -178,8 +181,10 @@ def decrease(lit: EmissionProblem, column: np.ndarray) -> float:
         return np.stack([np.bincount(owner, weight[:, c] * values[:, c], int(owner.max(initial=-1)) + 1) for c in range(3)], 1)
 
     light = of_objects(predicted**2)
+    # Projection of the column on the light that an object receives: the gain of the object can do as much.
     shared = np.divide(of_objects(mean * predicted), light, out=np.zeros(light.shape), where=light > 0)
     towards = (of_objects(mean * residual) - shared * of_objects(predicted * residual)).sum(0)
+    # Noise can make <a_1 a_2>, and the difference in Eq. L.41, too small or negative. Both floors keep the quotient finite.
     own = of_objects(np.maximum(first * second, 0.3 * mean**2)).sum(0)
     curvature = np.maximum(own - (shared**2 * light).sum(0), 0.1 * own)
     decrease = np.divide(np.maximum(towards, 0.0) ** 2, curvature, out=np.zeros(3), where=curvature > 0)

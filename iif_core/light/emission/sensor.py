@@ -27,4 +27,5 @@ class Sensor:
         if self.is_hdr:
             return np.maximum(value, 0.0), np.zeros(value.shape, bool)
         bound = value >= self.saturation
+        # From saturation on a value proves no more than f^-1(I_sat) / exposure.
         return self.curve.inverse(np.clip(value, 0.0, self.saturation)) / exposure, bound

@@ -67,9 +67,11 @@ def discs(sky: Sky, texel: int, texels: np.ndarray) -> list[Disc]:
         if not apart[i]:
             continue
         cosine = fine @ fine[i]
+        # Further middles are at least half a fine texel from this one.
         apart &= cosine < np.cos(0.5 * near / FINER)
         for radius in RADII:
             angle = radius * near / FINER
+            # The margin takes in texels at the radius itself, whatever rounding says.
             own = np.flatnonzero(cosine >= np.cos(angle) - 1e-9) if radius else np.array([i])
             found.append(Disc(fine[i], angle, own))
     return found
@@ -153,6 +155,7 @@ class SunQuestion:
 
     def _of(self, sun: np.ndarray | None) -> EmissionProblem:
         """The problem of the other groups, and of those of a sun as one."""
+        # Columns of the last T groups are summed over the texels of one sun, which have one radiance.
         matrix = self.problem.rows.matrix
         some = matrix[:, :, :, : len(self.prior.initial)]
         if sun is not None:

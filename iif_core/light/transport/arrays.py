@@ -130,6 +130,7 @@ class Batch:
     def samples(self, count: int) -> tuple[Any, Any]:
         """(first, end) sample number of every lane, so that the lanes of a point share `count` samples."""
         lane = dr.arange(mi.UInt32, self.lanes) % dr.opaque(mi.UInt32, self.split)
+        # The first `left` lanes of a point take one sample more than the others.
         each, left = (dr.opaque(mi.UInt32, value) for value in divmod(count, self.split))
         first = lane * each + dr.minimum(lane, left)
         return first, first + each + dr.select(lane < left, mi.UInt32(1), 0)
@@ -145,6 +146,7 @@ class Batch:
         `number`: (n,) uint32 of the caller's points, by which their lanes are numbered, so that a point has the same random
         numbers whatever other points there are; None = by their place among all points.
         """
+        # `SeedSequence` mixes a seed of any size into four words that do not resemble those of the next seed.
         words = np.random.SeedSequence(seed).generate_state(4)
         lane = dr.arange(mi.UInt32, self.lanes)
         if number is None:
@@ -152,6 +154,7 @@ class Batch:
         else:
             split = dr.opaque(mi.UInt32, self.split)
             lane = dr.repeat(on_device(number[self.part], mi.UInt32), self.split) * split + lane % split
+        # Two hashes of eight rounds: 64 bits of state, and 64 bits that select the sequence.
         a, b = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[0])), dr.opaque(mi.UInt32, int(words[1])), 8)
         c, d = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[2])), dr.opaque(mi.UInt32, int(words[3])), 8)
         return mi.PCG32(1, (mi.UInt64(a) << 32) | mi.UInt64(b), (mi.UInt64(c) << 32) | mi.UInt64(d))

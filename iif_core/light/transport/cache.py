@@ -32,6 +32,7 @@ class VoxelRows:
         i, j, k = (mi.Int32(dr.floor((x - low) * self._inverse_edge)) for x, low in zip(point, self._origin, strict=True))
         # One unsigned test covers both ends: negative indices wrap to huge values.
         inside = (mi.UInt32(i | j | k) < 65536) & (object_id >= -1) & (object_id < 65535)
+        # The two words of a key, with the object in the upper half of the second (`iif_core.surface.cells`).
         low = mi.UInt32(i) | (mi.UInt32(j) << 16)
         high = mi.UInt32(k) | (mi.UInt32(object_id + 1) << 16)
         h = hash_words(low, high)
@@ -49,6 +50,7 @@ def _probe(slots: Any, mask: Any, probes: Any, low: Any, high: Any, h: Any, step
         found |= match
         h += step
         probe += 1
+        # An empty slot ends the search, because no later slot can hold the key.
         searching &= ~match & (entry.z != 0xFFFFFFFF) & (probe < probes)
     return found, row
 
@@ -77,6 +79,7 @@ class RadianceCache:
             raise InputError(f"cache radiance goes down to {radiance.min()}; radiance is never negative")
         self.count = len(ijk)
         self.edge, self.origin = edge, np.asarray(origin, np.float32)
+        # One radiance for a voxel, whatever objects its surface belongs to.
         self._rows = VoxelRows(edge, origin, ijk, -1)
         self._radiance = on_device(np.column_stack([radiance, np.zeros(len(ijk))])) if len(ijk) else mi.Float(0, 0, 0, 0)
 

@@ -39,6 +39,8 @@ def uv_maps(corners: Array, uv: Array) -> Array:
     corners, uv = np.asarray(corners, np.float64), np.asarray(uv, np.float64)
     edges = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], 2)
     steps = np.stack([uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]], 2)
+    # Two edges fix the gradient in the plane of the triangle. The pseudo-inverse adds no component along the normal, and is 0
+    # for a triangle without area.
     gradient = steps @ np.linalg.pinv(edges, rcond=1e-9)
     offset = uv[:, 0] - np.einsum("kci,ki->kc", gradient, corners[:, 0])
     return np.concatenate([gradient, offset[..., None]], 2).reshape(-1, 8)
@@ -73,6 +75,7 @@ class EditedMaterials:
         self._to_uv = on_device(textures.to_uv)
         place = np.stack([textures.first, textures.width, textures.height, np.zeros(count)], 1)
         self._place = on_device(place.astype(np.uint32), mi.UInt32)
+        # Eight floats a texel, of which two aligned reads fetch a material.
         self._texels = on_device(np.pad(np.clip(textures.texels, LOWEST, 1), [(0, 0), (0, 3)]))
 
     def __call__(self, point: Any, face: Any, object_id: Any, active: Any) -> tuple[Any, Any, Any]:
@@ -82,6 +85,7 @@ class EditedMaterials:
             place = mi.Point3f(point.x - away.x, point.y - away.y, point.z - away.z)
         if self._first is None:
             return self.room(place, face, object_id, active)
+        # What was put in has the last face ids.
         inserted = active & (face >= self._first)
         colour, roughness, metallic = self.room(place, face, object_id, active & ~inserted)
         own_colour, own_roughness, own_metallic = self._textured(point, face - self._first, inserted)
@@ -96,6 +100,7 @@ class EditedMaterials:
         u_map = dr.gather(mi.Vector4f, self._to_uv, number * 2, active)
         v_map = dr.gather(mi.Vector4f, self._to_uv, number * 2 + 1, active)
         place = dr.gather(mi.Vector4u, self._place, number, active)
+        # Lanes that are not active read a size of 0, by which no remainder can be taken.
         column, next_column, right = _around(point, u_map, dr.maximum(place.y, 1))
         row, next_row, below = _around(point, v_map, dr.maximum(place.z, 1))
         colour, roughness, metallic = mi.Color3f(0), mi.Float(0), mi.Float(0)
@@ -112,7 +117,9 @@ class EditedMaterials:
 def _around(point: Any, to_coordinate: Any, size: Any) -> tuple[Any, Any, Any]:
     """(texel, next texel, share of the next) along one axis of a texture that repeats."""
     value = to_coordinate.w + point.x * to_coordinate.x + point.y * to_coordinate.y + point.z * to_coordinate.z
+    # Repeat beyond [0, 1); centres of texels lie at + 0.5.
     value = (value - dr.floor(value)) * mi.Float(size) - 0.5
     low = dr.floor(value)
+    # `low` is -1 before the first centre, whose neighbour is the last texel.
     first = mi.UInt32(mi.Int32(low) + mi.Int32(size)) % size
     return first, (first + 1) % size, value - low

@@ -58,6 +58,7 @@ class Emitters:
         environment_weight: ArrayLike | None = None,
         environment_share: float | None = None,
     ):
+        # -------- radiance and sides --------
         faces = len(geometry.faces)
         radiance = rows_of(radiance, faces, 3, "emitter radiance")
         side = np.zeros(faces, np.int8) if side is None else np.asarray(side)
@@ -65,11 +66,15 @@ class Emitters:
             raise InputError(f"emitter side has shape {side.shape}; expected ({faces},) of -1, 0 or +1")
         if radiance.min() < 0:
             raise InputError("emitter radiance is negative somewhere; radiance is never negative")
+
+        # -------- how often each face and texel is drawn --------
+        # Area x mean radiance is the power of a face up to the factor pi.
         power = geometry.areas * radiance.mean(axis=1, dtype=np.float64)
         weight = power if sampling_weight is None else rows_of(sampling_weight, faces, None, "sampling_weight")
         if weight.min() < 0:
             raise InputError("sampling_weight is negative somewhere")
         self.radiance, self.side, self.environment = radiance, side.astype(np.int8), as_map(environment)
+        # A density per area is infinite on a face without area, and no ray meets it.
         weight = np.where(geometry.areas > 0, weight, 0.0)
         sky = _sky_weight(self.environment, environment_weight)
         if sky.any():
@@ -77,12 +82,20 @@ class Emitters:
                 environment_share = share_of_environment(
                     geometry, power.sum(), texel_weights(self.environment).sum() / (4 * np.pi)
                 )
+            # Faces and texels share the draws. Without a face to draw, the environment has all of them.
             weight = np.concatenate(
                 [_scaled(weight, 1 - environment_share), _scaled(sky.ravel(), environment_share if weight.any() else 1.0)]
             )
+
+        # -------- coincident faces --------
+        # The first face is drawn for all of its copies. A ray may meet a copy, which therefore reports the same density: the two
+        # weights of Eq. S.6 must agree on it.
         first, copies = _coincident(geometry, np.flatnonzero(weight[:faces] > 0), side)
         weight[first] += weight[copies]
         weight[copies] = 0
+
+        # -------- table of slots (Eq. L.10) --------
+        # m^2 of each face, then sr of each texel.
         measure = np.concatenate([geometry.areas, solid_angles(*sky.shape).ravel()])[: len(weight)]
         self.slots, pdf = _slots(weight, measure)
         self.pdf_area = pdf[:faces]
@@ -90,8 +103,12 @@ class Emitters:
         self.pdf_sky = pdf[faces:].reshape(sky.shape) if sky.any() else np.zeros(sky.shape, np.float32)
         self.can_be_sampled = len(self.slots) > 0
         self.sky_is_sampled = bool(self.pdf_sky.any())
+
+        # -------- copies on the device --------
+        # Numbers that differ between scenes are opaque, so that scenes share compiled kernels.
         self._slots = on_device(self.slots, mi.UInt32) if self.can_be_sampled else None
         self._faces, self._last_slot = (dr.opaque(mi.UInt32, value) for value in (faces, max(len(self.slots), 1) - 1))
+        # R, G, B and density of a face in one read. Where all faces shine to both sides, kernels do not read sides at all.
         self._radiance_pdf = on_device(np.column_stack([radiance, self.pdf_area]))
         self._side = on_device(self.side) if np.any(self.side) else None
         self._constant = [dr.opaque(mi.Float, float(value)) for value in self.environment[0, 0]]
@@ -132,10 +149,12 @@ class Emitters:
 
     def sample(self, u: Any, active: Any) -> tuple[Any, Any, Any]:
         """Draw (face, on_sky, texel) with the densities that `surface` and `texel` report, from a uniform u in [0, 1)."""
+        # The number of slots is a power of two, so the product has no rounding. The limit guards against u = 1.
         slot = dr.minimum(mi.UInt32(u * mi.Float(self._last_slot + 1)), self._last_slot)
         drawn = dr.gather(mi.UInt32, self._slots, slot, active)
         if not self.sky_is_sampled:
             return drawn, mi.Bool(False), mi.UInt32(0)
+        # Numbers from `faces` on are texels.
         on_sky = drawn >= self._faces
         return dr.select(on_sky, 0, drawn), on_sky, dr.select(on_sky, drawn - self._faces, 0)
 
@@ -152,7 +171,7 @@ def share_of_environment(geometry: Geometry, power: float, sky: float) -> float:
 
 def _escape_share(geometry: Geometry, rays: int = 4096) -> float:
     """Share of cosine-distributed rays from random points of both sides of the surface that leave the mesh."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(0)  # fixed: a mesh has one share, whatever the seed of a trace
     face = rng.choice(len(geometry.areas), rays, p=geometry.areas / geometry.areas.sum())
     root, u2 = np.sqrt(rng.random(rays)), rng.random(rays)
     corners = geometry.vertices[geometry.faces[face]].astype(np.float64)
@@ -168,9 +187,11 @@ def _coincident(geometry: Geometry, drawn: Array, side: Array) -> tuple[Array, A
 
     A ray meets one of them only, so drawing a point on each would count its light twice.
     """
+    # Faces that list the same corners in another order get the same key once their corners are sorted.
     corners = geometry.vertices[geometry.faces[drawn]]
     order = np.lexsort((corners[..., 2], corners[..., 1], corners[..., 0]), axis=1)
     key = np.take_along_axis(corners, order[..., None], 1).reshape(-1, 9)
+    # 9 i + 3 j + k numbers the permutation that sorts the corners. An odd one turns the normal over, and the side with it.
     turned = np.where(np.isin(order @ np.array([9, 3, 1]), (5, 15, 19)), 1, -1)  # even permutations of 0 1 2
     key = np.column_stack([key, turned * side[drawn]])
     _, group, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
@@ -178,6 +199,7 @@ def _coincident(geometry: Geometry, drawn: Array, side: Array) -> tuple[Array, A
     if len(count) == len(drawn):
         return drawn[:0], drawn[:0]
     by_group = np.argsort(group, kind="stable")
+    # Place in `by_group` of the first member of each face's set; every later member is a copy.
     start = np.repeat(np.cumsum(count) - count, count)
     is_copy = np.arange(len(drawn)) > start
     return drawn[by_group[start[is_copy]]], drawn[by_group[is_copy]]
@@ -209,11 +231,13 @@ def _slots(weight: Array, measure: Array) -> tuple[Array, Array]:
     items = np.flatnonzero(weight > 0)
     if not len(items):
         return np.zeros(0, np.uint32), pdf
+    # A power of two, which `Emitters.sample` relies on.
     count = max(MIN_SLOTS, 1 << int(4 * len(items) - 1).bit_length())
     share = weight[items] / weight[items].max()
     share *= (count - len(items)) / share.sum()
     counts = 1 + np.floor(share).astype(np.int64)
     rest = count - counts.sum()
+    # The slots that rounding down left over go to the largest remainders; the stable sort settles ties by id.
     counts[np.argsort(-np.round((share - np.floor(share)) / REMAINDER_STEP), kind="stable")[:rest]] += 1
     pdf[items] = counts / count / measure[items]
     return np.repeat(items, counts).astype(np.uint32), pdf

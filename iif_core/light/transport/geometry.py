@@ -34,6 +34,7 @@ class Geometry:
 
     def __init__(self, vertices: Array, faces: Array, object_id: Array, transmittance: Array | None = None):
         self.vertices, self.faces, self.object_id, self.transmittance = vertices, faces, object_id, transmittance
+        # float64, because edges are differences of nearby coordinates and a normal is one of nearby products.
         corners = vertices.astype(np.float64)[faces]
         edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         normals = np.cross(edge1, edge2)
@@ -45,6 +46,8 @@ class Geometry:
         if not solid.any():
             raise InputError(f"the mesh has no face of area >= {MIN_AREA} m^2 among {len(faces)}; give a mesh with surface")
 
+        # -------- ray tracing --------
+        # The tracer holds faces with area only and numbers them anew; `_face_of_primitive` leads back to ids of the mesh.
         primitives = np.flatnonzero(solid)
         mesh = mi.Mesh("scene", len(vertices), len(primitives), has_vertex_normals=False, has_vertex_texcoords=False)
         parameters = mi.traverse(mesh)
@@ -53,7 +56,9 @@ class Geometry:
         parameters.update()
         self.scene = mi.load_dict({"type": "scene", "mesh": mesh})
 
+        # -------- tables that kernels read by face --------
         self._face_of_primitive = None if solid.all() else on_device(primitives, mi.UInt32)
+        # The bits of the id ride in the fourth float, so that one read fetches both.
         self._normal_object = on_device(np.column_stack([self.normals, object_id.view(np.float32)]))
         self._corner = on_device(_padded(corners[:, 0]))
         self._edge1, self._edge2 = on_device(_padded(edge1)), on_device(_padded(edge2))
@@ -133,8 +138,10 @@ def _first_stop(geometry: Geometry, origin: Any, direction: Any, active: Any, sa
     hit, face, t = geometry.nearest(origin, direction, active)
     going = geometry.passes(face, direction, t, hit, salt)
     while going:
+        # A new ray starts behind the sheet. `offset_from` moves it along the ray in place of a normal.
         past = offset_from(mi.Point3f(dr.fma(direction, t, origin)), direction * dr.rcp(dr.norm(direction)))
         hit, face, further = geometry.nearest(past, direction, going)
+        # Distance of the whole ray, so that densities per solid angle hold behind any number of sheets (Eq. S.5).
         t = dr.norm(past - origin) * dr.rcp(dr.norm(direction)) + further
         going = geometry.passes(face, direction, t, hit, salt)
     return hit, face, t
@@ -171,6 +178,7 @@ def build_geometry(
         share = rows_of(transmittance, len(faces), None, "transmittance")
         if share.min() < 0 or share.max() >= 1:
             raise InputError(f"transmittance of {share.min():g} to {share.max():g}; expected shares in [0, 1)")
+    # Vertices that no face uses may still be non-finite here.
     return Geometry(np.where(np.isfinite(vertices), vertices, 0), faces, object_id, share)
 
 
@@ -216,6 +224,7 @@ def cosine_directions(normals: ArrayLike, rng: np.random.Generator) -> Array:
     normals = np.asarray(normals, np.float64)
     ball = rng.normal(size=normals.shape)
     # A uniform point on the sphere that touches the surface from above is cosine-distributed.
+    # The factor keeps the sum off 0 where the point lies opposite to the normal.
     return (1 + 1e-6) * normals + ball / np.linalg.norm(ball, axis=1, keepdims=True)
 
 

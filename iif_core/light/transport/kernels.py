@@ -106,6 +106,7 @@ def _evaluate(vertex: Vertex, wi: Any, chance: Any) -> tuple[Any, Any, Any]:
     NoL, NoV, NoH, VoH, sin2_h = brdf.half_angles(DRJIT, vertex.normal, wi, vertex.wo)
     diffuse, spec, fc = brdf.lobes(DRJIT, NoL, NoV, NoH, VoH, sin2_h, vertex.roughness)
     pdf = brdf.mixture_pdf(DRJIT, NoL, NoH, VoH, sin2_h, vertex.roughness, chance)
+    # With k_d = 0 `compose` leaves the specular part of Eq. R.7.
     return vertex.kd * diffuse, brdf.compose(0, vertex.ks, 0, spec * (1 - fc), spec * fc), pdf
 
 
@@ -121,6 +122,7 @@ def sample_lobe(choose_specular: Any, u1: Any, u2: Any, wo: Any, normal: Any, ro
     Returns:
         Unit direction, possibly below the surface.
     """
+    # Every lane evaluates both candidates and keeps one, so the two may share u1 and u2.
     half = to_world(brdf.sample_ggx_half(DRJIT, u1, u2, roughness), normal)
     mirrored = dr.normalize(mi.Vector3f(*brdf.reflect(wo, half)))
     return dr.select(choose_specular, mirrored, to_world(brdf.sample_cosine(DRJIT, u1, u2), normal))
@@ -161,27 +163,40 @@ def sample_light(world: World, rng: Any, point: Any, normal: Any, active: Any) -
     Returns:
         The sample.
     """
+    # u0 picks a face or a texel, (u1, u2) the point on the face or the direction in the texel.
     emitters, geometry = world.emitters, world.geometry
     u0, u1, u2 = uniform(rng), uniform(rng), uniform(rng)
     face, on_sky, texel = emitters.sample(u0, active)
+
+    # -------- point on a face: density per area, then per solid angle (Eq. S.5) --------
+    # The square root makes barycentric coordinates uniform over the triangle.
     root = dr.sqrt(u1)
     target = geometry.point_on_face(face, 1 - root, root * u2, active)
     light_normal, _ = geometry.normal_and_object(face, active)
     offset = mi.Vector3f(target - point)
     distance2 = dr.squared_norm(offset)
     distance = dr.sqrt(distance2)
+    # A receiver on the drawn point itself has no direction to it. The tests of `valid` below sort such samples out.
     wi = offset / dr.maximum(distance, 1e-20)
     cos_front = -dr.dot(light_normal, wi)
     radiance, pdf_area, emits, _ = emitters.surface(face, cos_front, active)
     pdf = pdf_area * distance2 / dr.abs(cos_front)
+    # A face that is seen edge-on has no finite density.
     valid = emits & (dr.abs(cos_front) > 1e-7)
     # Up to 1e-3 of the distance in front of the emitter counts as the emitter: numerics.md#visibility-of-a-light.
     reach = distance * (1 - 1e-3)
+
+    # -------- or a direction to the environment, in lanes that drew a texel --------
     if emitters.sky_is_sampled:
         sky, sky_pdf = emitters.texel(texel, active & on_sky)
         radiance, pdf = dr.select(on_sky, sky, radiance), dr.select(on_sky, sky_pdf, pdf)
+        # A lane uses (u1, u2) for the face or for the texel, never for both.
         wi = dr.select(on_sky, emitters.direction_to(texel, u1, u2), wi)
+        # Whatever the ray meets hides the environment, however far away it is.
         valid, reach = (valid & ~on_sky) | (active & on_sky), dr.select(on_sky, dr.inf, reach)
+
+    # -------- visibility --------
+    # Only lanes whose sample can contribute trace a shadow ray.
     valid &= (dr.dot(normal, wi) > 0) & (pdf > 0)
     valid &= ~geometry.occluded(point, wi, reach, valid, geometry.draw_salt(rng))
     return LightSample(valid, face, on_sky, texel, radiance, wi, pdf)
@@ -200,6 +215,7 @@ def light_by_lobe(world: World, rng: Any, vertex: Vertex, active: Any) -> tuple[
         The sample and its weights f cos w / pdf (Color3f) in the diffuse and in the specular lobe.
     """
     light = sample_light(world, rng, vertex.point, vertex.normal, active)
+    # `pdf` is p_b of Eq. S.6: the density with which the path itself would continue towards the light.
     diffuse, specular, pdf = _evaluate(vertex, light.wi, _specular_chance(vertex))
     share = dr.select(light.valid, power_weight(light.pdf, pdf) / light.pdf, 0)
     return light, diffuse * share, specular * share
@@ -219,6 +235,7 @@ def scatter_by_lobe(rng: Any, vertex: Vertex, active: Any) -> tuple[Any, Any, An
     chance = _specular_chance(vertex)
     wi = sample_lobe(choice < chance, u1, u2, vertex.wo, vertex.normal, vertex.roughness)
     diffuse, specular, pdf = _evaluate(vertex, wi, chance)
+    # A direction below the surface ends the path. A second draw in its place would not have the density `pdf`.
     goes_on = active & (dr.dot(vertex.normal, wi) > 0) & (pdf > 0)
     return goes_on, wi, *(dr.select(goes_on, lobe / pdf, 0) for lobe in (diffuse, specular)), pdf
 
@@ -226,6 +243,7 @@ def scatter_by_lobe(rng: Any, vertex: Vertex, active: Any) -> tuple[Any, Any, An
 def _roulette(rng: Any, bounce: Any, throughput: Any, active: Any) -> tuple[Any, Any]:
     """Russian roulette (Eq. S.11): (survives, 1 / survival probability); before `ROULETTE_START` every path survives."""
     chance = dr.minimum(dr.max(throughput), ROULETTE_LIMIT)
+    # With a chance of 1 every path survives, because `uniform` never returns 1.
     chance = dr.select(bounce >= ROULETTE_START, chance, 1)
     survives = active & (uniform(rng) < chance) & (dr.max(throughput) > 0)
     return survives, dr.select(survives, 1 / chance, 0)
@@ -268,6 +286,7 @@ def incoming(
     Returns:
         Gain (Color3f) and the random stream.
     """
+    # The loop carries these variables, so each has its device type before it starts.
     gain = mi.Color3f(0)
     throughput = mi.Color3f(throughput)
     origin = mi.Point3f(origin)
@@ -276,28 +295,48 @@ def incoming(
     bounce = mi.UInt32(bounce)
     active = mi.Bool(active)
     while active:
+        # -------- nearest surface along the ray --------
         hit = nearest_hit(world.geometry, origin, direction, active, world.geometry.draw_salt(rng))
+
+        # -------- emission that the ray finds, first term of Eq. S.10 --------
+        # `pdf` is the density with which the last vertex drew this direction; the other argument of `power_weight` is the
+        # density with which `sample_light` would have drawn the same light. A texel that is never drawn has density 0, hence
+        # weight 1.
         escapes = active & ~hit.valid
         texel = world.emitters.texel_along(direction)
         sky, sky_pdf = world.emitters.texel(texel, escapes)
         gain += world.collector.environment(texel, sky, throughput * power_weight(pdf, sky_pdf), escapes)
         cos_front = -dr.dot(hit.normal, direction)
         radiance, pdf_area, emits, is_emitter = world.emitters.surface(hit.face, cos_front, hit.valid)
+        # Eq. S.5: `t` is the distance to the last vertex in metres, because the direction has length 1.
         weight = power_weight(pdf, pdf_area * hit.t * hit.t / dr.abs(cos_front))
         gain += world.collector.emitter(hit.face, radiance, throughput * weight, emits)
+
+        # -------- end in the radiance cache --------
+        # A voxel may hold a lamp and its housing, so emitting faces do not ask the cache. At bounce 0 a camera ray has met its
+        # first surface, which is always shaded.
         found, cached = _take_from_cache(world, hit.point, throughput, hit.valid & ~is_emitter & (bounce >= 1))
         gain += cached
 
+        # -------- the point becomes a vertex of the path --------
+        # A surface that is met edge-on has no side on which it is seen and counts as a miss.
         active &= hit.valid & ~found & (bounce < max_bounces) & (cos_front != 0)
         normal = dr.select(cos_front < 0, -hit.normal, hit.normal)
         wo = -direction
         base_color, roughness, metallic = world.material(hit.point, hit.face, hit.object_id, active)
         origin = offset_from(hit.point, normal)
         vertex = Vertex(origin, normal, wo, *brdf.kd_ks(base_color, metallic), roughness)
+
+        # -------- next-event estimation, second term of Eq. S.10 --------
         gain += _direct_light(world, rng, vertex, throughput, active)
+
+        # -------- next direction --------
+        # `pdf` stays with the direction: the next turn weighs the emission that it finds by it.
         active, direction, diffuse, specular, pdf = scatter_by_lobe(rng, vertex, active)
         throughput *= diffuse + specular
         bounce += 1
+
+        # -------- Russian roulette (Eq. S.11) --------
         active, boost = _roulette(rng, bounce, throughput, active)
         throughput *= boost
     return gain, rng

@@ -41,8 +41,10 @@ class LampCache:
         points, light = np.asarray(points, np.float32), np.asarray(light)
         kind = _kind(np.asarray(object_id), dominant_side(normals))
         fine, sparse, mean = _cells(edge, points, kind, light, LEAST)
+        # Places in sparse cells are put together in larger voxels, where a single place is enough.
         coarse, _, rest = _cells(COARSER * edge, points[sparse], kind[sparse], light[sparse], 1)
         self.light = np.concatenate([mean, rest])
+        # Rows of the coarse cells follow the fine ones in `light`.
         self._tables = [
             (table, dr.opaque(mi.UInt32, first)) for table, first in ((fine, 0), (coarse, len(mean))) if table is not None
         ]
@@ -51,12 +53,14 @@ class LampCache:
 
     def find(self, point: Any, normal: Any, object_id: Any, distance: Any, active: Any) -> tuple[Any, Any]:
         """Return (found, row) of the cell of surface that a ray met after `distance` metres, on the side `normal`."""
+        # `frames.dominant_side` on the device, with the same weights of the axes.
         x, y, z = (dr.abs(part) * weight for part, weight in zip(normal, AXIS_WEIGHTS, strict=True))
         axis = dr.select((x >= y) & (x >= z), 0, dr.select(y >= z, 1, 2))
         along = dr.select(axis == 0, normal.x, dr.select(axis == 1, normal.y, normal.z))
         side = mi.Int32(2 * axis) + dr.select(along < 0, 1, 0)
         kind, active = _kind(mi.Int32(object_id), side), active & (distance > self._near)
         found, row = mi.Bool(False), mi.UInt32(0)
+        # The fine table first; the coarse one is asked only where it has no cell.
         for table, first in self._tables:
             here, own = table.find(point, kind, active & ~found)
             row = dr.select(here, first + own, row)
@@ -67,6 +71,7 @@ class LampCache:
     def add(self, collector: Any, row: Any, weight: Any, active: Any) -> Any:
         """Add the light of all lamps times `weight` (Color3f) to the rows of a `lamps.LampCollector`; return the gain, 0."""
         gain, lamp = mi.Color3f(0), mi.UInt32(0)
+        # A loop on the device: one kernel serves any number of lamps.
         while lamp < self._lamps:
             light = dr.gather(mi.Color3f, self._light, row * self._lamps + lamp, active)
             gain += collector.add(lamp, weight * light, active)
@@ -84,6 +89,7 @@ def _cells(edge: float, points: Array, kind: Array, light: Array, least: int) ->
     _, first, of, count = np.unique(pack_keys(ijk, kind), return_index=True, return_inverse=True, return_counts=True)
     of = of.ravel()
     order = np.argsort(of, kind="stable")
+    # `order` lines up the places of each cell, so a cell is one run of rows.
     mean = np.add.reduceat(light[order].astype(np.float64), np.cumsum(count) - count) / count[:, None, None]
     enough = count >= least
     own = first[enough]

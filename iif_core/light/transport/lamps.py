@@ -71,6 +71,7 @@ def _follow(
         du = uniform(rng) - 0.5
         dv = uniform(rng) - 0.5
         toward = dr.normalize(direction + du * d_du + dv * d_dv)
+        # Nothing else finds what a camera ray meets; an infinite density gives it weight 1.
         gain, rng = incoming(world, rng, origin, toward, dr.inf, 0, max_bounces, True)
         nothing += gain
         sample += 1
@@ -131,5 +132,6 @@ def render_lamps(
             dr.opaque(mi.UInt32, paths.max_bounces),
         )
         dr.eval(gain, sums)
+        # (points, lanes of a point, lamp, channel).
         result[batch.part] = to_numpy(sums).reshape(-1, batch.split, lamps, 3).sum(axis=1)
     return result / np.float32(paths.samples)

@@ -57,8 +57,10 @@ def _drawn_light(world: World, rng: Any, origin: Any, normal: Any, number: Any, 
     strata, so that every lamp has its share of the draws at every point. Returns the gain, 0."""
     if not world.emitters.can_be_sampled:
         return mi.Color3f(0)
+    # `sample_light` draws the emitter first, so the given number picks the emitter and the rest stays random.
     light = sample_light(world, _Given((number + uniform(rng)) / count, rng), origin, normal, mi.Bool(True))
     cosine = dr.maximum(dr.dot(normal, light.wi), 0) * dr.inv_pi
+    # DRAWS emitters stand against one direction, so their density counts DRAWS times (Eq. S.6).
     share = dr.select(light.valid, cosine * power_weight(DRAWS * light.pdf, cosine) / (DRAWS * light.pdf), 0)
     return light.gain(world, mi.Color3f(share))
 
@@ -79,13 +81,17 @@ def _trace_points(
     nothing = mi.Color3f(0)
     origin = offset_from(point, normal)
     while sample < end:
+        # -------- emitters drawn at the point --------
         for draw in range(DRAWS):
             nothing += _drawn_light(world, rng, origin, normal, DRAWS * mi.Float(sample) + draw, DRAWS * mi.Float(samples))
+
+        # -------- direction of density cos / pi --------
         # The first number of a direction is drawn once in each of as many strata as there are samples.
         u1 = dr.minimum((mi.Float(sample) + uniform(rng)) / mi.Float(samples), 1 - 2**-24)
         u2 = uniform(rng)
         wi = to_world(brdf.sample_cosine(DRJIT, u1, u2), normal)
         pdf = dr.dot(normal, wi) * dr.inv_pi
+        # cos / pi over the density is 1, so the path starts with throughput 1.
         gain, rng = _arriving(world, known, rng, origin, wi, pdf, max_bounces)
         nothing += gain
         sample += 1
@@ -99,6 +105,7 @@ def _arriving(
     one = pdf / DRAWS  # against the density of one draw of an emitter, of which there are DRAWS for each direction
     if known is None:
         return incoming(world, rng, origin, direction, one, 1, max_bounces, pdf > 0)
+    # With one interaction at most, the point itself, `incoming` collects emission and stops.
     emitted, rng = incoming(world, rng, origin, direction, one, 1, 1, pdf > 0)
     reflected, rng = _reflected(world, known, rng, origin, direction, max_bounces, (pdf > 0) & (max_bounces > 1))
     return emitted + reflected, rng
@@ -109,23 +116,32 @@ def _reflected(
 ) -> tuple[Any, Any]:
     """Collect what the surface that a ray meets reflects: of known light if there is some, and its gloss, or all of a path, from
     the path that goes on. Returns the gain, 0, and the random stream."""
+    # -------- the surface that the ray meets --------
     hit = nearest_hit(world.geometry, origin, direction, active, world.geometry.draw_salt(rng))
     front = -dr.dot(hit.normal, direction)
     active &= hit.valid & (front != 0)
     normal = dr.select(front < 0, -hit.normal, hit.normal)
     base_color, roughness, metallic = world.material(hit.point, hit.face, hit.object_id, active)
     kd, ks = brdf.kd_ks(base_color, metallic)
+
+    # -------- its diffuse light, where it is known --------
     found, row = known.find(hit.point, normal, hit.object_id, hit.t, active)
     gain = known.add(world.collector, row, kd, found)
+
+    # -------- the rest: its gloss alone, or a whole path --------
+    # Where the diffuse light is known, a path follows in the GGX lobe with the probability of this lobe. 1 / chance makes up for
+    # the paths that do not.
     chance = brdf.specular_chance(DRJIT, dr.max(kd), dr.max(ks), dr.dot(normal, -direction))
     goes_on = active & (~found | (uniform(rng) < chance))
     over = dr.select(found, dr.rcp(chance), 1)
+    # Known: k_d = 0, and the GGX lobe for certain. Not known: both lobes, as at any vertex.
     diffuse, lobe = dr.select(found, mi.Color3f(0), kd), dr.select(found, 1, chance)
     vertex = Vertex(offset_from(hit.point, normal), normal, -direction, diffuse, ks, roughness, lobe)
     if world.emitters.can_be_sampled:
         light, *shares = light_by_lobe(world, rng, vertex, goes_on)
         gain += light.gain(world, over * (shares[0] + shares[1]))
     goes_on, wi, *shares, pdf = scatter_by_lobe(rng, vertex, goes_on)
+    # Two interactions so far: the point of the map, and this surface.
     more, rng = incoming(world, rng, vertex.point, wi, pdf, 2, max_bounces, goes_on, over * (shares[0] + shares[1]))
     return gain + more, rng
 
@@ -215,6 +231,8 @@ def known_light(
     """
     geometry, rng = scene.geometry, np.random.default_rng(paths.seed)
     points, normals = np.asarray(points, np.float64), np.asarray(normals, np.float64)
+
+    # -------- places that reflect light to the map --------
     row = rng.choice(len(points), int(np.ceil(LEARNED * len(points))), replace=False)
     start, way = points[row] + 1e-4 * normals[row], cosine_directions(normals[row], rng)
     way /= np.linalg.norm(way, axis=1, keepdims=True)
@@ -224,9 +242,12 @@ def known_light(
     met = np.flatnonzero((face >= 0) & (np.asarray(lamp_of_face)[face] < 0) & (distance > NEAR * edge))
     if not len(met) or paths.max_bounces == 0 or not lamps:
         return None
+
+    # -------- their light --------
     face, way = face[met], way[met]
     place = start[met] + distance[met, None] * way
     normal = geometry.normals[face]
+    # The side from which the ray came.
     normal = np.where(np.einsum("ij,ij->i", normal, way)[:, None] > 0, -normal, normal)
     light = light_maps(scene, place, normal, lamp_of_face, lamps, paths, environment_lamp)
     return LampCache(edge, place, normal, np.asarray(object_of_face)[face], light)

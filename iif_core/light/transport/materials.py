@@ -77,6 +77,7 @@ class CellMaterials:
         if not len(object_values):
             raise InputError("CellMaterials needs at least one row of object_values: the material of surface nobody saw")
         coarse_ijk, coarse_object, coarse = coarse_cells(self._ijk, self._object_id, values)
+        # Which coarse cells there are does not depend on their values, so a repainted copy keeps the table.
         if self._coarse is None:
             edge, origin = self._grid
             self._coarse = VoxelRows(COARSE * edge, origin, coarse_ijk, coarse_object)
@@ -97,6 +98,7 @@ class CellMaterials:
         return other
 
     def __call__(self, point: Any, face: Any, object_id: Any, active: Any) -> tuple[Any, Any, Any]:
+        # From the finest to the coarsest: cell, coarse cell, object. The row after the objects holds the mean of all.
         found, row = self._cells.find(point, object_id, active)
         near, around = self._coarse.find(point, object_id, active & ~found)
         known = (object_id >= 0) & (object_id < self._objects)

@@ -36,6 +36,7 @@ class _ColumnCollector:
         self.specular: Any = None
 
     def emitter(self, face: Any, radiance: Any, weight: Any, active: Any) -> Any:
+        # Radiance is the unknown of the system, so the weight is added by itself and `radiance`, which is 0, is not used.
         group = dr.gather(mi.Int32, self.group_of_face, face, active)
         return self._deposit(mi.UInt32(group), weight, active & (group >= 0))
 
@@ -46,6 +47,7 @@ class _ColumnCollector:
         return self._deposit(mi.UInt32(group), weight, active & (group >= 0))
 
     def _deposit(self, group: Any, weight: Any, active: Any) -> Any:
+        # rho of Eq. L.14: the share of either lobe in the first factor of the throughput splits the weight of the whole path.
         for lobe, share in enumerate((1 - self.specular, self.specular)):
             entry = ((self.lane * 2 + lobe) * self.groups + group) * 3
             for channel in range(3):
@@ -62,17 +64,23 @@ class _ColumnCollector:
 
 @dr.syntax
 def _deposit_paths(world: World, rng: Any, vertex: Vertex, sample: Any, end: Any, max_bounces: Any) -> Any:
+    # Each lane follows its samples one after the other. The collector holds A; what is returned is h, from the radiance cache.
     diffuse_cached = mi.Color3f(0)
     specular_cached = mi.Color3f(0)
+    # The normal is on the viewer's side already, so this leaves out points that are seen edge-on.
     visible = dr.dot(vertex.normal, vertex.wo) > 0
     while sample < end:
+        # -------- next-event estimation at the point itself --------
         if world.emitters.can_be_sampled:
             light, diffuse, specular = light_by_lobe(world, rng, vertex, visible)
             world.collector.specular = _share(specular, diffuse)
             light.gain(world, diffuse + specular)
+
+        # -------- path that continues from the point --------
         goes_on, wi, diffuse, specular, pdf = scatter_by_lobe(rng, vertex, visible)
         share = _share(specular, diffuse)
         world.collector.specular = share
+        # The point is the first interaction. The throughput holds both lobes; `share` takes them apart at every deposit.
         gain, rng = incoming(world, rng, vertex.point, wi, pdf, 1, max_bounces, goes_on, diffuse + specular)
         diffuse_cached += gain * (1 - share)
         specular_cached += gain * share
@@ -113,6 +121,7 @@ def transport_matrix(
     Raises:
         InputError: wrong shapes, non-finite numbers, column numbers out of range.
     """
+    # -------- inputs, with materials moved into their range --------
     position, normals, wo = checked_points(points.points, points.normals, points.wo)
     count, n_groups = len(position), columns.count
     base_color = np.clip(rows_of(points.base_color, count, 3, "base_color"), 0, 1)
@@ -122,14 +131,18 @@ def transport_matrix(
     matrix, cached = np.zeros((count, 2, n_groups, 3), np.float32), np.zeros((count, 2, 3), np.float32)
     if paths.max_bounces == 0 or n_groups == 0 and scene.cache is None:
         return matrix, cached
+
+    # -------- emitters of unknown radiance --------
     weight = columns.sampling_weight
     if weight is None:
         weight = _group_weights(scene.geometry.areas, groups, n_groups)
     columns = columns._replace(of_texel=texels, sampling_weight=weight)
     scene = scene._replace(emitters=_unit_emitters(scene.geometry, groups, columns, texel_weight))
     group_of_face, group_of_texel = on_device(groups, mi.Int32), None if texels is None else on_device(texels, mi.Int32)
+
+    # -------- trace, batch by batch --------
     kd, ks = brdf.kd_ks(base_color, metallic[:, None])
-    width = 6 * n_groups
+    width = 6 * n_groups  # floats of a row: 2 lobes x G groups x 3 channels
     for batch in batches(count, paths.samples, width, paths.chunk):
         rows = dr.zeros(mi.Float, batch.lanes * max(width, 1))
         lane = dr.arange(mi.UInt32, batch.lanes)
@@ -143,6 +156,7 @@ def transport_matrix(
         for lobe, gain in enumerate(gains):
             cached[batch.part, lobe] = batch.collect(gain) / paths.samples
         if n_groups:
+            # (points, lanes of a point, lobe, group, channel). The lanes of a point are added in a fixed order.
             summed = to_numpy(rows).reshape(-1, batch.split, 2, n_groups, 3).sum(axis=1)
             matrix[batch.part] = summed / paths.samples
     return matrix, cached
@@ -171,6 +185,7 @@ def _unit_emitters(geometry: Geometry, groups: Array, columns: EmitterColumns, t
     if texels is None or texels.size == 1:
         return Emitters(geometry, dark, columns.side, sampling_weight=columns.sampling_weight)
     solid = solid_angles(*texels.shape)
+    # Both kinds count with radiance 1 wherever they may emit: area of the faces, share of the sphere.
     share = share_of_environment(geometry, geometry.areas[groups >= 0].sum(), (solid * (texels >= 0)).sum() / (4 * np.pi))
     drawn = (solid if texel_weight is None else np.asarray(texel_weight)) * (texels >= 0)
     return Emitters(geometry, dark, columns.side, np.zeros((*texels.shape, 3)), columns.sampling_weight, drawn, share)
@@ -184,5 +199,6 @@ def _group_weights(areas: Array, groups: Array, n_groups: int) -> Array:
     filled = np.count_nonzero(total)
     if not filled:
         return np.zeros(len(areas))
+    # 1 / area of every group: area x share adds up to 1 over its faces.
     share = np.divide(1.0, total, out=np.zeros(n_groups), where=total > 0)
     return 0.5 * area / total.sum() + 0.5 * area * np.where(member, share[groups], 0.0) / filled

@@ -34,7 +34,9 @@ def _radiance_sum(
     while sample < end:
         du = uniform(rng) - 0.5
         dv = uniform(rng) - 0.5
+        # Jitter after normalisation would widen the footprint away from the centre of the picture (Eq. S.20).
         toward = dr.normalize(direction + du * d_du + dv * d_dv)
+        # Nothing else finds what a camera ray meets; an infinite density gives it weight 1.
         radiance, rng = incoming(world, rng, origin, toward, dr.inf, 0, max_bounces, True)
         total += radiance
         sample += 1
@@ -114,6 +116,7 @@ def first_hits(
     face = np.full(len(directions), -1, np.int32)
     for part in chunks(len(directions), chunk):
         way = vectors(mi.Vector3f, directions[part])
+        # No salt: guides show a sheet that lets light through, not what lies behind it.
         hit = nearest_hit(geometry, vectors(mi.Point3f, origins[part]), way, mi.Bool(True), salt=None)
         base_color, _, _ = material(hit.point, hit.face, hit.object_id, hit.valid)
         toward = dr.select(dr.dot(hit.normal, way) > 0, -hit.normal, hit.normal)

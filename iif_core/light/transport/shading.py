@@ -28,6 +28,8 @@ class _Levels:
 
     def __init__(self, levels: Array):
         self.levels = [float(level) for level in levels]
+        # Lambda of Eq. S.8: the levels nearest to four values in geometric progression. `dict.fromkeys` drops a level that is
+        # nearest to two.
         wanted = np.geomspace(min(levels.min(), 0.5), 0.5, 4) if len(levels) else []
         nearest = [int(np.argmin(np.abs(np.log(levels / value)))) for value in wanted]
         self.lobes = [self.levels[index] for index in dict.fromkeys(nearest)]
@@ -36,6 +38,7 @@ class _Levels:
 
     def lobe_roughness(self, lobe: Any) -> Any:
         roughness = mi.Float(1)
+        # Python unrolls the loop: the kernel gets one select for each lobe.
         for number, level in enumerate(self.lobes):
             roughness = dr.select(lobe == self.cosine_lobes + number, level, roughness)
         return roughness
@@ -83,10 +86,14 @@ def _lobe_sums(
     end: Any,
     max_bounces: Any,
 ) -> Any:
+    # D, then S0 and S1 at every level.
     sums = [mi.Color3f(0) for _ in range(1 + 2 * len(levels.levels))]
     origin = offset_from(point, normal)
     while sample < end:
+        # -------- next-event estimation, first term of Eq. S.9 --------
         sums = levels.light(world, rng, origin, normal, wo, sums)
+
+        # -------- direction from the mixture of lobes (Eq. S.8) --------
         # Stratified choice: every lobe is drawn equally often in expectation over all samples.
         position = (mi.Float(sample) + uniform(rng)) / mi.Float(samples)
         lobe = dr.minimum(mi.UInt32(position * levels.count), levels.count - 1)
@@ -94,8 +101,12 @@ def _lobe_sums(
         u2 = uniform(rng)
         wi = sample_lobe(lobe >= levels.cosine_lobes, u1, u2, wo, normal, levels.lobe_roughness(lobe))
         angles = brdf.half_angles(DRJIT, normal, wi, wo)
+        # Density of the whole mixture, whichever lobe drew the direction: the balance heuristic.
         pdf = levels.pdf(angles)
         useful = (dr.dot(normal, wi) > 0) & (dr.dot(normal, wo) > 0) & (pdf > 0)
+
+        # -------- light that arrives along it, second term of Eq. S.9 --------
+        # The point itself is the first interaction.
         radiance, rng = incoming(world, rng, origin, wi, pdf, 1, max_bounces, useful)
         sums = levels.accumulate(sums, angles, dr.select(useful, radiance / pdf, 0))
         sample += 1
