@@ -3,7 +3,8 @@
 `study <study>` collects the scores of a study, `grid <study>` draws a sheet of its pictures, `design <study>` chooses the runs
 of a screening, `relighting` keeps the rows of that study and makes its page, `stability` measures numerical errors or collects
 them, `points` takes points of speed and accuracy from a study, `claims` takes from the study `regret` what is expected of
-decisions, and `costs` fits the cost of jobs again. `python -m lab.prior` and `python -m lab.freeze` have their own commands.
+decisions, `costs` fits the cost of jobs again, and `pack <capture> <folder>` makes a folder scene of a capture. `python -m
+lab.prior` and `python -m lab.freeze` have their own commands.
 """
 
 from __future__ import annotations
@@ -45,6 +46,9 @@ def parser() -> argparse.ArgumentParser:
     stability.add_argument("--fingerprint", help="of the code; recorded by Snakemake, not checked")
     command("points")
     command("claims")
+    pack = command("pack")
+    pack.add_argument("capture", type=Path, help="folder of a finished stage `capture`, such as results/kitchen/capture")
+    pack.add_argument("folder", type=Path, help="where the scene goes; new or empty")
     costs = command("costs")
     costs.add_argument("--sizes", action="store_true", help="the jobs ran next to others: take memory and disk, but no times")
     costs.add_argument("results", nargs="*", type=Path, help="folders like results/ whose finished jobs are added to the table")
@@ -124,6 +128,12 @@ def _costs(options: argparse.Namespace) -> int:
     from lab.costs import refit
 
     return guarded("costs", lambda: print("\n".join(refit(options.results, sizes=options.sizes))))
+
+
+def _pack(options: argparse.Namespace) -> int:
+    from lab.packing import pack
+
+    return guarded("pack", lambda: print("\n".join(pack(options.capture, options.folder))))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 EQUATION = re.compile(r"\bEqs?\. ([A-Z])\.(\d+[a-z]?)(?:(?:, | and | to |-)(?:([A-Z])\.)?(\d+[a-z]?))*")
 NUMBER = re.compile(r"\b([A-Z])\.(\d+[a-z]?)\b")
 PAGE = re.compile(r"(?<![\w/.-])(?:docs|lab/notebook)/[\w/-]+\.md(?:#[\w-]+)?")
-LINK = re.compile(r"(?<!!)\[[^\]\n]*\]\(([^)\s]+)\)|!\[[^\]]*\]\(([^)\s]+)\)")
+LINK = re.compile(r"(?<!!)\[[^\]]*\]\(([^)\s]+)\)|!\[[^\]]*\]\(([^)\s]+)\)")
 UNSHIPPED = re.compile(r"\b[A-Z]{6,} (?:\d+\.\d+|H\d+)\b|\bH\d{1,2}\b")  # sections of papers in capitals, numbered hazards
 PAGE_OF_LETTER = {
     "R": "reflectance",

@@ -18,8 +18,12 @@ TRUE = {"job": 2.0, "pixels": 30.0, "faces": 0.0, "paths": 1.5}
 
 
 @pytest.fixture(scope="module")
-def document(repository):
-    return settings.dump(settings.load("kitchen", "draft", repository))
+def document(tmp_path_factory):
+    """Settings of a room that is rendered."""
+    root = tmp_path_factory.mktemp("scene")
+    (root / "config/scenes").mkdir(parents=True)
+    (root / "config/scenes/room.yaml").write_text("source: {kind: builtin, scene: kitchen}\n")
+    return settings.dump(settings.load("room", "draft", root))
 
 
 def planted(rooms=6, of_room=8, noise=0.0, seed=0):

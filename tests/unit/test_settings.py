@@ -417,3 +417,14 @@ def test_a_name_that_nothing_is_scattered_by_is_refused():
         settings.refuse_scatter({"prior": 0}, ("prior",))
     with pytest.raises(InputError, match="--set-scatter piror: nothing is scattered by this name. Did you mean prior"):
         settings.refuse_scatter({"piror": 8}, ("prior",))
+
+
+def test_the_profiles_of_slurm_know_every_stage(repository):
+    """A stage that no group names would be a job by itself between those of its scene."""
+    from workflow.registry import STAGES
+
+    stages = {name for name, stage in STAGES.items() if not stage.on_demand} - {"publish"}
+    whole = yaml_file.read_yaml(repository / "workflow/profiles/slurm-scenes/config.yaml")
+    assert {group.partition("=")[0] for group in whole["groups"]} == stages
+    single = yaml_file.read_yaml(repository / "workflow/profiles/slurm/config.yaml")
+    assert set(single["set-threads"]) - {"prior_part"} == stages - {"plan"}

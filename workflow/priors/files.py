@@ -16,7 +16,7 @@ import numpy as np
 from iif_core.errors import InputError
 from iif_core.numerics.color import linear_from_srgb
 from workflow.scene.normal_form import CaptureReader, View
-from workflow.settings.names import did_you_mean_path
+from workflow.settings.names import data_folder, did_you_mean_path
 from workflow.sources.folder_scene import images
 
 PROPERTIES = ("albedo", "roughness", "metallic")
@@ -134,7 +134,7 @@ def _folder(path: str | None, source: str | None) -> Path:
     base = path or source
     if base is None:
         raise InputError("`prior.path`: missing, and the source has no folder; name the folder that holds predictions/")
-    folder = Path(base)
+    folder = data_folder(str(base))
     folder = folder if folder.name == "predictions" else folder / "predictions"
     if not folder.is_dir():
         raise InputError(

@@ -12,6 +12,7 @@ import numpy as np
 from iif_core.errors import InputError
 from iif_core.priors.simulate import RGBX, shading_proxy, simulate_predictions
 from workflow.scene.normal_form import CaptureReader, View
+from workflow.settings.names import data_folder
 
 _NO_TRUTH = (
     "`prior: {kind: simulated}` spoils ground truth, and this capture has none;"
@@ -22,7 +23,7 @@ _NO_TRUTH = (
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
     """Return no files, but refuse a folder without `truth/` before any job starts."""
     source = document["source"]
-    if source["kind"] == "folder" and not (Path(source["path"]) / "truth").is_dir():
+    if source["kind"] == "folder" and not (data_folder(source["path"]) / "truth").is_dir():
         raise InputError(_NO_TRUTH)
     return []
 

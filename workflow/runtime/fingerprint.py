@@ -27,6 +27,7 @@ from workflow.intake.names import shown
 from workflow.registry import STAGES
 from workflow.runtime import input_digests
 from workflow.settings import study_files
+from workflow.settings.names import EXAMPLES
 from workflow.settings.relight import recombines
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -55,7 +56,7 @@ FILE_MODULES = {
     "relit_truth": ("workflow.sources.relit",),
 }
 _HERE = f"{REPOSITORY}/"
-_OWN = tuple(f"{_HERE}{package}/" for package in PACKAGES)
+_OWN = tuple(f"{_HERE}{name}/" for name in (*PACKAGES, EXAMPLES))
 NEEDED = tuple(stage.name for stage in STAGES.values() if not stage.on_demand)
 """Stages that every scene needs, in order."""
 VGG = Path("results/weights/lpips_vgg.npz")

@@ -17,7 +17,7 @@ from iif_core.camera.distortion import Distortion, Pinhole, distort
 from iif_core.errors import InputError
 from iif_core.objects.mask_clustering import flatten_masks
 from workflow.scene.normal_form import CaptureReader, View
-from workflow.settings.names import did_you_mean_path
+from workflow.settings.names import data_folder, did_you_mean_path
 from workflow.sources.folder_scene import images
 
 ASPECT_TOLERANCE = 0.02
@@ -128,7 +128,7 @@ def _folder(path: str | Path | None, source: str | Path | None) -> Path:
     base = path or source
     if base is None:
         raise InputError("`segmentation.path`: missing, and the source has no folder; name the folder that holds masks/")
-    folder = Path(base).parent if Path(base).is_file() else Path(base)  # a source may be a file: a scene's XML
+    folder = Path(base).parent if Path(base).is_file() else data_folder(str(base))  # a source may be a file: a scene's XML
     folder = folder if folder.name == "masks" else folder / "masks"
     if not folder.is_dir():
         raise InputError(

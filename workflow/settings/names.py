@@ -20,6 +20,8 @@ LONG = 200
 """Characters from which nothing similar is looked for."""
 MANY = 10_000
 """Files of a folder among which a similar name is looked for."""
+EXAMPLES = "examples"
+"""Folder of the repository with scenes that anyone can run."""
 RESERVED = ("batch", "studies", "weights")
 """Folders of results/ that do not belong to a scene."""
 
@@ -32,6 +34,14 @@ def configuration(part: str, root: Path = Path(".")) -> Path:
     """
     own = root / "config" / part
     return own if own.exists() else REPOSITORY / "config" / part
+
+
+def data_folder(path: str) -> Path:
+    """Return a folder that a scene file names. It counts from the working folder; where there is none, `examples/...` is an
+    example that comes with the repository."""
+    given, shipped = Path(path), REPOSITORY / path
+    example = given.parts[:1] == (EXAMPLES,) and ".." not in given.parts
+    return shipped if example and not given.exists() and shipped.is_dir() else given
 
 
 def quality_names(root: Path = Path(".")) -> list[str]:

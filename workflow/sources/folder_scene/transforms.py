@@ -21,7 +21,7 @@ from iif_core.errors import InputError
 from workflow.intake import limits
 from workflow.intake.documents import read_json
 from workflow.intake.names import fault_of_name, same_name, shown
-from workflow.settings.names import did_you_mean_path
+from workflow.settings.names import data_folder, did_you_mean_path
 from workflow.sources.folder_scene import images
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048, "in": 0.0254}
@@ -151,7 +151,7 @@ def choose_entries(entries: list[dict[str, Any]], views: int) -> list[dict[str, 
 
 def folder_at(source: dict[str, Any], holds: str) -> Path:
     """Return `source.path`, which must be a folder; `holds` says in messages what it contains."""
-    folder = Path(source["path"])
+    folder = data_folder(source["path"])
     if not folder.is_dir():
         found, hint = ("is a file", "") if folder.exists() else ("not found", did_you_mean_path(folder))
         raise InputError(f"{folder}: {found}; `source.path` must be a folder with {holds} (docs/guide/own-data.md).{hint}")
