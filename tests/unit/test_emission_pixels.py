@@ -6,7 +6,7 @@ import numpy as np
 
 from iif_core.light.emission.direct import EmissionPrior
 from iif_core.light.emission.pixels import EmissionPixels, choose_pixels, tile_of
-from iif_core.light.emission.problem import assemble
+from iif_core.light.emission.problem import ANCHOR_WEIGHT, assemble
 from iif_core.light.emission.rows import TracedTransport
 
 
@@ -56,6 +56,28 @@ def test_a_pane_behind_blinds_is_as_bright_as_its_light_and_not_as_its_pixels():
     assert whole.max() < 0.6 * truth
     rows = assemble(pixels, transport, 1)
     assert rows.rows.lower_bound[rows.anchor].all() and rows.anchor.sum() == 2 * seen
+
+
+def test_both_ends_of_a_pane_outweigh_the_rows_of_its_own_group():
+    """Groups 0 and 1 shine on the room far more than the pane, group 2, and neither may lend it its factor (Eq. L.17)."""
+    rng = np.random.default_rng(4)
+    n, seen, n_groups = 300, 30, 3
+    group = np.where(np.arange(n) < seen, 2, -1)
+    light = np.array([8.0, 2.0, 0.5])[:, None] * rng.uniform(0.8, 1.2, (n, n_groups, 3))
+    y = (light * 10).sum(1)
+    y[:seen] = 6.0
+    coverage = np.zeros((n, n_groups), np.float32)
+    coverage[:seen, 2] = 0.4
+    pixels = EmissionPixels(y, np.zeros((n, 3), bool), np.zeros(n, int), np.zeros(n, int), np.arange(n), group, coverage, 5.0)
+    transport = TracedTransport(np.broadcast_to(light.astype(np.float32), (2, 1, n, n_groups, 3)), np.zeros((2, 1, n, 3)))
+    found = assemble(pixels, transport, n_groups)
+    weight, matrix = found.rows.weight[found.anchor], found.rows.matrix[0, 0][found.anchor]
+    upper = (matrix < 0).any((1, 2))
+    assert upper.sum() == seen and (~upper).sum() == seen
+    # An upper end looks at the same pane, through the same pixels, as its lower end.
+    np.testing.assert_allclose(weight[upper].mean(0), weight[~upper].mean(0), rtol=0.5)
+    elsewhere = (found.rows.weight[~found.anchor][:, None] * found.rows.matrix[0, 0][~found.anchor].astype(float) ** 2).sum(0)
+    assert (weight.sum(0) >= 0.99 * elsewhere[2]).all() and (weight.sum(0) < 0.1 * ANCHOR_WEIGHT * elsewhere[0]).all()
 
 
 def test_averaged_rows_hold_the_means_of_what_was_observed_and_cached():

@@ -227,7 +227,8 @@ def _strengthened(rows: EmissionRows, anchor: np.ndarray) -> EmissionRows:
     mean = 0.5 * (first + second)
     # Numerator of Eq. L.17 without the factor, (G, 3): what the light of each group does in rows that are no anchors.
     elsewhere = np.einsum("nc,ngc->gc", np.where(anchor[:, None], 0.0, rows.weight), mean.astype(np.float64) ** 2)
-    group = mean[anchor].max(2).argmax(1)
+    # The group that an anchor looks at: its own column alone differs from 0, and is negative in rows of upper ends (Eq. L.16).
+    group = np.abs(mean[anchor]).max(2).argmax(1)
     weight = rows.weight.copy()
     own = np.zeros(elsewhere.shape)
     # Bounds that are met carry nothing, so where a group is also seen unsaturated only that counts.
