@@ -16,9 +16,9 @@ def interpolate_levels(shading: np.ndarray, levels: np.ndarray, roughness: np.nd
     y0, y1 = (shading[k, i].astype(np.float64) for i in (j, j + 1))
     h = (levels[j + 1] - levels[j])[:, None]
     mean = (y1 - y0) / h
-    initial_population, after = np.maximum(j - 1, 0), np.minimum(j + 2, len(levels) - 1)
-    h_before, h_after = (levels[j] - levels[initial_population])[:, None], (levels[after] - levels[j + 1])[:, None]
-    mean_before = (y0 - shading[k, initial_population]) / np.where(h_before > 0, h_before, 1.0)
+    before, after = np.maximum(j - 1, 0), np.minimum(j + 2, len(levels) - 1)
+    h_before, h_after = (levels[j] - levels[before])[:, None], (levels[after] - levels[j + 1])[:, None]
+    mean_before = (y0 - shading[k, before]) / np.where(h_before > 0, h_before, 1.0)
     mean_after = (shading[k, after] - y1) / np.where(h_after > 0, h_after, 1.0)
     inner0, inner1 = _slope(mean_before, mean, h_before, h), _slope(mean, mean_after, h, h_after)
     d0 = np.where(h_before > 0, inner0, _end(mean, mean_after, h, h_after))

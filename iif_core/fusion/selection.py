@@ -25,7 +25,7 @@ def selection_weights(error: NDArray, temperature: float, usable: NDArray | None
     any_usable = np.isfinite(lowest)
     # With the smallest error subtracted, the best prediction has exp(0) = 1, and the sum cannot underflow at any temperature
     # (docs/method/numerics.md#cold-temperatures).
-    excess = np.where(usable, error, 0.0) - np.where(any_usable, lowest, 0.0)
+    excess = np.where(usable, np.where(usable, error, 0.0) - np.where(any_usable, lowest, 0.0), 0.0)
     ranked = np.sort(counted, -1)
     middle = np.maximum(usable.sum(-1, keepdims=True) - 1, 0) // 2  # rank of the lower median among the usable ones
     median = np.where(any_usable, np.take_along_axis(ranked, middle, -1), 0.0)
@@ -33,7 +33,7 @@ def selection_weights(error: NDArray, temperature: float, usable: NDArray | None
         weight = np.exp(-excess / (temperature * (median + 1e-6)))  # 1e-6: all errors may be 0
     else:
         weight = (excess <= 1e-9 * median + 1e-12).astype(np.float64)
-    # An unusable prediction has the excess 0 - lowest <= 0, and would get the largest weight.
+    # An unusable prediction has the excess 0, and would share the largest weight.
     weight = np.where(usable, weight, 0.0)
     total = weight.sum(-1, keepdims=True)
     return weight / np.where(total > 0, total, 1.0)

@@ -178,9 +178,13 @@ def test_size_from_headers(document, tmp_path):
     Image.new("RGB", (640, 480)).save(photo)
     box = {**document, "capture": {**document["capture"], "views": 16, "width": 160, "height": 160}}
     folder = {**box, "source": {"kind": "folder"}}
-    found = size.estimate(folder, [mesh, photo, tmp_path / "gone.png"])
+    extras = [tmp_path / "masks/0.png", tmp_path / "truth/albedo/0.png"]
+    for extra in extras:
+        extra.parent.mkdir(parents=True)
+        Image.new("L", (640, 480)).save(extra)
+    found = size.estimate(folder, [mesh, photo, tmp_path / "gone.png", *extras])
     assert (found.views, found.pixels, found.faces, found.exact) == (1, 160 * 120, 1234, False)
-    assert found.source_mb == pytest.approx((mesh.stat().st_size + photo.stat().st_size) / 1e6)
+    assert found.source_mb == pytest.approx(sum(path.stat().st_size for path in (mesh, photo, *extras)) / 1e6)
     photo.write_bytes(b"no picture")
     mesh.write_bytes(b"ply\nelement face 999999999999\n")  # a header that cannot be true
     found = size.estimate(folder, [mesh, photo])

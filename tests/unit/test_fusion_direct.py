@@ -617,3 +617,10 @@ print(hashlib.sha256(result.value.tobytes() + result.scale.tobytes() + repr(resu
         assert done.returncode == 0, done.stderr
         digests.add(done.stdout)
     assert len(digests) == 1
+
+
+def test_a_failed_prediction_overflows_nothing_at_low_temperatures():
+    """Its error is smaller than every usable one's."""
+    with np.errstate(all="raise", under="ignore"):
+        weight = selection_weights([1.0, 5.0, 0.9], 1e-4, [True, True, False])
+    assert weight.tolist() == [1.0, 0.0, 0.0]

@@ -10,6 +10,8 @@ from typing import Any
 from workflow.costs.work import SceneSize
 
 IMAGES = (".png", ".jpg", ".jpeg", ".exr")
+EXTRAS = {"truth", "masks", "instances", "depth", "predictions"}
+"""Folders of a scene whose pictures are not photographs (docs/guide/own-data.md#4-the-folder)."""
 MESHES = (".ply", ".obj", ".glb", ".serialized")
 BYTES_PER_FACE = 36
 """Of a mesh whose header does not say how many faces it has: a guess between binary and text, which is good enough because costs
@@ -46,12 +48,17 @@ def estimate(document: dict[str, Any], files: list[Path]) -> SceneSize:
     faces = sum(_faces(path, size) for path, size in bytes_.items() if path.suffix.lower() in MESHES)
     if source["kind"] == "mitsuba":
         return SceneSize(capture["views"], rendered, faces)
-    images = [path for path in bytes_ if path.suffix.lower() in IMAGES]
+    images = [path for path in bytes_ if path.suffix.lower() in IMAGES and not _is_extra(path)]
     views = min(capture["views"], max(len(images), 1))
     width, height = _picture(images[0], box) if images else box
     scale = min(1.0, box[0] / width, box[1] / height)
     pixels = views * max(round(width * scale), 1) * max(round(height * scale), 1)
     return SceneSize(views, float(pixels), faces, sum(bytes_.values()) / 1e6)
+
+
+def _is_extra(path: Path) -> bool:
+    """Return whether a picture lies in a folder of truth, masks and the like, next to the photographs."""
+    return not EXTRAS.isdisjoint((path.parent.name, path.parent.parent.name))
 
 
 def _faces(path: Path, size: int) -> float:
