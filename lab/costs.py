@@ -24,8 +24,8 @@ def refit(folders: Iterable[Path], table: Path = TABLE, fits: Path = SHIPPED, si
             jobs of a folder are of one machine, whose factor is found by what the table says of such jobs.
         table: CSV file of rows (`workflow.costs.records.write_rows`).
         fits: JSON file that is written.
-        sizes: the jobs of the folders ran beside others: take their memory and disk, and times only of kinds of which there are
-            none.
+        sizes: the jobs of the folders shared the machine with other jobs. Take their memory and disk, but take their times only
+            for kinds of which the table has no times.
     """
     rows = list(read_rows(table)) if table.is_file() else []
     before, lines = len(rows), []

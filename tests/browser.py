@@ -51,7 +51,7 @@ class Seen:
         page: of Playwright.
         messages: (type, text) of its console.
         errors: exceptions that nothing caught.
-        requests: addresses, that of the page first.
+        requests: addresses, the page's own first.
     """
 
     page: Any
@@ -61,12 +61,12 @@ class Seen:
 
     @property
     def complaints(self) -> list[str]:
-        """Errors, and messages of the console of type error, which is how violations of the policy are told."""
+        """Errors, and messages of type error on the console, by which the browser reports violations of the policy."""
         return self.errors + [text for kind, text in self.messages if kind == "error"]
 
     @property
     def outside(self) -> list[str]:
-        """Requests for anything but the page itself and what it made of its own data."""
+        """Requests for anything but the page itself and what it made from its own data."""
         return [address for address in self.requests[1:] if not address.startswith(("blob:", "data:"))]
 
 

@@ -1,5 +1,6 @@
-"""A test that hangs is ended and named. What it started is told and killed after `LIMIT` seconds, which lets a test that waits
-for it go on, and fail; a test that hangs itself is ended by `faulthandler_timeout` of pyproject.toml, which ends its process."""
+"""A test that hangs is ended and named. After `LIMIT` seconds, the processes that it started are reported and killed, so a test
+that waits for one of them continues, and fails. If the test itself hangs, `faulthandler_timeout` of pyproject.toml ends its
+process."""
 
 from __future__ import annotations
 

@@ -231,7 +231,7 @@ def main() -> int:
     from workflow.runtime.job import configure_logging
     from workflow.runtime.job_state import JobState
 
-    log = None if arguments.command in STAGES else arguments.log  # that of a stage belongs to the process that makes it
+    log = None if arguments.command in STAGES else arguments.log  # the log of a stage belongs to the process that makes it
     if guarded("the log", lambda: configure_logging(log)):
         return 1
     if arguments.command in STAGES:

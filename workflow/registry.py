@@ -16,7 +16,7 @@ class Stage:
         upstream: stages whose files it reads.
         settings: dotted paths of the settings that it reads.
         reads_raw: whether files from outside results/ enter here.
-        on_demand: whether no scene needs it, only a study or a target of its own.
+        on_demand: whether no scene needs it, only a study or its own target.
         shared: stages whose files it reads in the folder of the scene that all variants of a study share.
     """
 

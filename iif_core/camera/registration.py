@@ -430,7 +430,7 @@ def _values(
 
 
 def _residuals(photos: Sequence[Photo], maps: Sequence[_Maps], state: _Cameras, rows: _Rows) -> np.ndarray:
-    """(n,) feature value less that of the point, which is the mean over the views that are not held out."""
+    """(n,) feature value minus the level of its point: the mean over the views that are not held out."""
     value = _values(photos, maps, state, rows, ("value",))[0]
     moving = np.array([not p.held for p in photos], np.float64)[rows.view]
     return value - _level(value, moving, rows.point)

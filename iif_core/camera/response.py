@@ -28,7 +28,7 @@ START: dict[str, tuple[float, ...]] = {
 SPLINE_BINS = (2, 8)
 """Smallest and largest number of bins K of a spline, which has 2 K parameters; 3 by default."""
 _SPLINE_POWER = 0.45
-_SPLINE_BOUND = 5.0  # of all parameters; allows slopes between 1/150 and 150 times that of x^0.45
+_SPLINE_BOUND = 5.0  # of all parameters; allows slopes between 1/150 and 150 times the slope of x^0.45
 _TOE = 1e-4  # end of the parabola that replaces a power near 0
 _GAMMA_BOUNDS = (0.6, 6.0)
 _A0_BOUNDS = (-2.0, 0.5)  # exponent at 0 between 0.135 and 1.65
@@ -245,7 +245,7 @@ class Response:
         # df/d rise_i = [i < j] + [i = j] by_h; the softmax turns it into r_i (df/d rise_i - sum_k r_k df/d rise_k).
         by_rise = (knot[:-1] < j[..., None]) + by_h[..., None] * (knot[:-1] == j[..., None])
         df[..., : bins - 1] = (rise * (by_rise - (rise * by_rise).sum(-1, keepdims=True)))[..., :-1]
-        for k, where in ((0, x <= 0.0), (bins, x >= 1.0)):  # the slope at an end is that of its knot
+        for k, where in ((0, x <= 0.0), (bins, x >= 1.0)):  # the slope at an end is the slope of its knot
             dslope[..., bins - 1 + k] = np.where(where, end * rate, 0.0)
         return f, end * rate, df, dslope
 

@@ -8,7 +8,7 @@ ProtocolName = Literal["raw", "gain", "scaled", "oracle_affine"]
 
 
 class Protocol(NamedTuple):
-    """What a prediction is forgiven before it is compared with the truth, in words of increasing length."""
+    """How a prediction is adjusted before it is compared with the truth: three texts, from short to long."""
 
     short: str
     words: str
@@ -34,10 +34,11 @@ PROTOCOLS_OF: dict[str, tuple[ProtocolName, ...]] = {
     "emission": ("raw", "scaled"),
     "rgb": ("raw",),
 }
+"""Quantity -> protocols. Photographs determine the level of roughness and metallic, but they may leave the level of emission and
+albedo open."""
 RELIT_PROTOCOLS: tuple[ProtocolName, ...] = ("raw", "gain", "scaled")
 RELIT = ("relit_lamp", "relit_moved", "relit_environment", "relit_sphere")
 """Pictures under new light: a lamp alone, a moved lamp, an environment, a glowing sphere."""
-"""Quantity -> protocols. Photographs determine the level of roughness and metallic; that of emission and albedo may be open."""
 
 
 class Metric(NamedTuple):

@@ -12,9 +12,9 @@ SMALLEST_SHARE = 0.01
 class LightSpread:
     """Spread over objects of the error of the light (Eq. E.16).
 
-    With L the true radiance, P that of the true materials under the computed light, and sums over the pixels and channels of an
-    object o, e_o = log(sum L / sum P). The spread is the standard deviation of e_o over objects of more than `SMALLEST_SHARE`
-    of the pixels. A factor that all objects share is left out.
+    L is the true radiance, and P is the radiance of the true materials under the computed light. The error of an object o is
+    e_o = log(sum L / sum P), with sums over its pixels and channels. The spread is the standard deviation of e_o over objects of
+    more than `SMALLEST_SHARE` of the pixels. It ignores a factor that all objects share.
     """
 
     def __init__(self) -> None:

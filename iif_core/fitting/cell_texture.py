@@ -1,7 +1,7 @@
 """Texture of surface cells from the photographs, once light, response and affine maps are known (Eq. M.47 to M.49).
 
-A prior that was made from the photographs alone (retinex) divided by a light that was not known yet; the division is done again,
-except for slow changes inside an object, which cannot be told from an error of the light.
+A prior that uses the photographs alone (retinex) divides them by light that is not known yet. This module repeats the division
+with the known light. It leaves out slow changes inside an object, because they cannot be distinguished from errors of the light.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from iif_core.surface.cells import pack_keys, voxel_indices
 BASE_WEIGHT = 2.0
 """Weight of the corrected base in a cell, in pixels of average sensitivity (a border pixel counts a tenth)."""
 SLOW_SCALE = 0.2
-"""Metres over which errors of the light change. Only the nearest 16 boxes of that Gaussian count (`slow_part`), so its effective
-width is 0.12 m, and that of `LIGHT_SMOOTHING` 0.03 m."""
+"""Metres over which errors of the light change. Only the nearest 16 boxes of the Gaussian count (`slow_part`), so its effective
+width is 0.12 m, and 0.03 m for `LIGHT_SMOOTHING`."""
 LIGHT_SMOOTHING = 0.05
 """Metres over which diffuse light is averaged (docs/method/numerics.md#dividing-by-noisy-light)."""
 _LARGEST_CHANGE = 0.5

@@ -92,8 +92,8 @@ class FitProgress:
 def fit_affines(problem: FitProblem, response: Response, options: FitOptions | None = None) -> FitResult:
     """Fit sixteen numbers for each object, and the response, by Gauss-Newton on all pixels at once.
 
-    Which numbers are free follows the texture (Eq. M.19). Objects with too few pixels have the mean of the population. Response
-    `identity` means linear radiance (HDR). The gauge is that of the given light (`gauge.apply_gauge` sets another).
+    The texture determines which numbers are free (Eq. M.19). Objects with too few pixels get the mean of the population. Response
+    `identity` means linear radiance (HDR). The given light sets the gauge (`gauge.apply_gauge` sets another).
     """
     opt = options or FitOptions()
     everything, tone = prepare_pixels(problem, response, opt.min_pixels, MAX_PIXELS_PER_OBJECT)
@@ -354,8 +354,8 @@ def result_of(
         given: (O, 2) roughness and metallic that are known, NaN = not known; None: nothing is.
 
     Returns:
-        Numbers of all objects; known ones have no variance. Those that were not fitted have the mean of the population, or the
-        identity without one; their albedo is that of the base at the level that the others have relative to it.
+        Numbers of all objects; known ones have no variance. Objects that were not fitted get the mean of the population, or the
+        identity without one. Their albedo is the base albedo at the level that the fitted objects have relative to their base.
     """
     state, n_objects = fit.state, len(counts)
 

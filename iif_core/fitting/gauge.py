@@ -26,8 +26,8 @@ class Gauge:
 
     Attributes:
         kind: `found`: the weighted mean of the given light and of `prior`; `prior`: the mean albedo of the base texture stays;
-            `mean_albedo`: the mean albedo of the fitted pixels is `albedo`; `white_patch`: that of the pixels of `patch` is;
-            `lamp`: the light is multiplied by `factor`.
+            `mean_albedo`: the mean albedo of the fitted pixels is `albedo`; `white_patch`: the mean albedo of the fitted pixels
+            in `patch` is `albedo`; `lamp`: the light is multiplied by `factor`.
         albedo: mean over the channels, in (0, 1]; patch: (n,) bool, pixels of the problem; factor: > 0.
         error: standard error of the logarithm of the level of the found light; infinite: not known.
         prior_error: the same of the level that the base texture implies.
@@ -54,8 +54,8 @@ class Gauge:
 def apply_gauge(problem: FitProblem, fit: FitResult, gauge: Gauge) -> FitResult:
     """Divide the albedo numbers of a fit by the factor of the gauge and multiply `light_scale` by it (Eq. M.42).
 
-    `facts["scale"]` records `kind`, `factor` and `relative_error`. For conventions the error is that of the fitted numbers alone
-    (Eq. M.44); it does not include the error of the convention.
+    `facts["scale"]` records `kind`, `factor` and `relative_error`. For a convention the error covers the fitted numbers alone
+    (Eq. M.44), not the convention itself.
     """
     factor, error = _factor(problem, fit, gauge)
     facts: dict[str, Any] = {**fit.facts, "scale": {"kind": gauge.kind, "factor": factor, "relative_error": error}}

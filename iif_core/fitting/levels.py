@@ -39,7 +39,7 @@ def _slope(left: np.ndarray, right: np.ndarray, h_left: np.ndarray, h_right: np.
 
 
 def _end(mean: np.ndarray, beyond: np.ndarray, h: np.ndarray, h_beyond: np.ndarray) -> np.ndarray:
-    """Return the slope at an outermost level: that of a parabola, limited to the monotone range."""
+    """Return the slope at an outermost level: the slope of a parabola, limited to the monotone range."""
     slope = ((2 * h + h_beyond) * mean - h * beyond) / (h + h_beyond)
     slope = np.where(h_beyond > 0, slope, mean)
     slope = np.where(slope * mean <= 0, 0.0, slope)

@@ -58,7 +58,7 @@ class ObjectLevels:
 
     Attributes:
         base: (O, 3) mean base albedo; shown: (O, 3) the level that the photographs ask for.
-        discrepancy: (O,) logarithm of the brightness that the photographs ask for over that of the base.
+        discrepancy: (O,) logarithm of the brightness that the photographs ask for over the brightness of the base.
         light_error, base_error: (O,) scale of the error of either estimate, as a logarithm.
         gain: (3,) mean of `shown` over `base`.
         light_gain: (O,) factor by which the light is brighter than computed, posterior mean (Eq. M.36).
@@ -233,8 +233,7 @@ def compare_levels(
 ) -> ObjectLevels:
     """Learn the errors of both estimates and divide each discrepancy between them (Eq. M.34 to M.36).
 
-    Both errors follow Student's t, so that of two estimates that disagree strongly the one that claims the smaller error is
-    believed.
+    Both errors follow Student's t. If two estimates disagree strongly, the one that claims the smaller error therefore prevails.
 
     Args:
         base: (O, 3) mean base albedo; shown: (O, 3) level that the photographs ask for.
@@ -342,8 +341,9 @@ def _log_t(x: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 
 def gain_of_the_rest(levels: ObjectLevels, affine: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the gain (3,) of objects that were not fitted, and half the width of the 68 % interval of its logarithm for one
-    object: the error of the base, and that of the mean.
+    """Return the gain (3,) of objects that were not fitted, and half the width of the 68 % interval of its logarithm.
+
+    The interval is for one object: it covers the error of the base and the error of the mean.
 
     The gain is the mean brightness that fitted objects have relative to their base. The gains of their affines would not do:
     they trade with offsets.

@@ -111,8 +111,8 @@ class FitOptions:
         select: choose between dielectric and metal, and the local minimum of the roughness, by their evidence; otherwise start at
             the identity, with metallic free where its predicted mean exceeds `metallic_prior`.
         metals: with `select`, whether an object may be a metal.
-        lobes: whether the photographs can tell roughness and metal: without specular lobes, roughness is that of the base, or
-            `MATTE_ROUGHNESS` where that is smoother, and nothing is metal.
+        lobes: whether the photographs can show roughness and metal. Without specular lobes, roughness is the base roughness, or
+            `MATTE_ROUGHNESS` where the base is smoother, and nothing is metal.
         metallic_prior: see `select`.
         base_tells_levels: the base is a second witness of the brightness of objects, next to the photographs.
         prediction_errors: how the predictions err that the base was made of; None: not known, and learnt from the scene.

@@ -142,8 +142,8 @@ def descend(
 ) -> Iterator[PublishedState]:
     """Descend from a state to the end of the schedule; yields the state after every epoch.
 
-    A descent that was interrupted goes on from any state that was yielded, to the same end. Numbers beyond 1e4 do not return,
-    because the clamps have no gradient; they end the descent, and the last state that is yielded is the one before.
+    An interrupted descent continues from any yielded state and ends with the same result. Numbers beyond 1e4 do not return,
+    because the clamps have no gradient. They end the descent, and the last yielded state is the one before.
     """
     n = len(problem.object_id)
     per_epoch = -(-n // options.batch)
@@ -173,7 +173,7 @@ def fit_published(
 ) -> FitResult:
     """Fit like `direct.fit_affines`, from the identity or from a `state`; `history` is the mean loss of the steps of each epoch.
 
-    `keep` is called with the state after each epoch, from which a fit that was interrupted goes on to the same end.
+    `keep` is called with the state after each epoch. An interrupted fit continues from it and ends with the same result.
     """
     opt, merged = options or PublishedOptions(), problem.merged()
     seen = merged.object_id >= 0

@@ -134,7 +134,7 @@ class Profile:
 
     Attributes:
         cost: (O, 3, R) data term plus prior with the albedo fitted; infinite where not tried. The roughest dielectric has the
-            better of its own cost and that without a specular lobe.
+            lower of two costs: its own, and the cost without a specular lobe.
         affine: (O, 3, R, 16) numbers; noise: (O,) variance of a row.
     """
 
@@ -288,7 +288,7 @@ def choose_kinds(
         posterior /= posterior.sum((1, 2), keepdims=True)
         histogram = _smoothed(posterior[counts].sum(0)) + _PSEUDO_OBJECTS * flat * flat.size
         histogram /= histogram.sum()
-        # A stated roughness is a prior of its own; the histogram then tells the kinds alone.
+        # A stated roughness is its own prior; the histogram then gives the kinds alone.
         prior = histogram if stated is None else np.broadcast_to(histogram.mean(1, keepdims=True), histogram.shape)
         if stated is None and counts.sum() >= FEWEST_OBJECTS:
             of_base[counts] = _likelihood_of_base(posterior[counts].sum(1), mean_base[counts, 3], pixels[counts])

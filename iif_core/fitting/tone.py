@@ -33,7 +33,7 @@ class Tone:
 
     @property
     def per_channel(self) -> bool:
-        """Whether each channel has parameters of its own."""
+        """Whether each channel has its own parameters."""
         return self.size > 0 and self.response.params.ndim == 2
 
     @property

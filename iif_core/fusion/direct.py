@@ -163,7 +163,7 @@ def _alternate(
 def _sweep_view(run: FusionPass, texture: NDArray, temperature: float, view: int) -> tuple[Block, NDArray]:
     """Fit maps, errors and selection of a view's segments to the texture; return the mixture (5, n) at its pixels.
 
-    Writes only the rows of its own segments in `run.state`, so views can run side by side.
+    Writes only the rows of this view's segments in `run.state`, so views can run in parallel.
     """
     options, sums, state = run.options, run.sums, run.state
     block = run.blocks(view)

@@ -1,7 +1,7 @@
 """Levels that the predictions leave open, and how they are fixed (docs/method/fusion.md#gauge).
 
-A *part* is a connected component of the graph of segments and cells, and has a level of its own (Eq. F.37). `anchor_shifts` holds
-it at the level of its predictions; `seam_shifts` removes the difference between the parts of an object.
+A *part* is a connected component of the graph of segments and cells. Each part has its own level (Eq. F.37). `anchor_shifts`
+holds a part at the level of its predictions; `seam_shifts` removes the difference between the parts of an object.
 """
 
 from __future__ import annotations

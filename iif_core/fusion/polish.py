@@ -54,7 +54,7 @@ def minimise_distribution_loss(
     """
     state, sums, floor = run.state, run.sums, run.options.scale_floor
     pixels = np.zeros(run.problem.n_segments)
-    state.affine[:] = IDENTITY  # the optimum lies near the identity, far from that of the least squares
+    state.affine[:] = IDENTITY  # the optimum lies near the identity, far from the least-squares optimum
     cells = CellSums(run.problem.n_cells)
     for block in run.map_views(run.blocks):
         pixels[block.segments] = np.add.reduceat(block.weight, block.start[:-1], dtype=np.float64) if len(block.cell) else 0

@@ -166,8 +166,8 @@ def prediction_faults(
     """Say why each of the K predictions of a view cannot be used.
 
     A prediction is unusable if more than `not_finite_share` of its pixels are not finite, or if its albedo is constant
-    over the picture while that of another prediction is not: signs that a diffusion model overflowed half precision
-    (docs/method/numerics.md#half-precision-overflow).
+    over the picture while the albedo of another prediction is not. Both are signs that a diffusion model overflowed half
+    precision (docs/method/numerics.md#half-precision-overflow).
 
     Args:
         maps: (K, ..., 5) predictions.

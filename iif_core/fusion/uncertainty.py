@@ -103,7 +103,7 @@ def gauge_free_error(value: NDArray, truth: NDArray, object_id: NDArray, ridge: 
 
     Args:
         value, truth: (n, c) cells, c channels of one property; object_id: (n,) int >= 0.
-        ridge: variance added to that of the truth, so that an object of one colour has B = 0 and not 0 / 0.
+        ridge: added to the variance of the truth, so that an object of one colour has B = 0 and not 0 / 0.
 
     Returns:
         (n, c) float64.

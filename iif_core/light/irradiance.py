@@ -34,7 +34,7 @@ WIDTH = 0.25
 """Cauchy width of log radiance inside a group; texture beyond it hardly counts."""
 SWEEPS = 15  # Gauss-Newton steps
 SPREAD = {"lamp": 1.5, "sky": 1.0, "unseen": 0.3, "albedo": 0.9}
-"""Standard deviations of the priors of log radiance and log albedo; that of a lamp that is not saturated is 0.2."""
+"""Standard deviations of the priors of log radiance and log albedo. A lamp that is not saturated has 0.2."""
 BRIGHT_TIMES = 10.0
 """Surface so many times brighter than the mean is a lamp, saturated or not: too small for rays in all directions."""
 LAMP_ABOVE = 2.0

@@ -37,7 +37,7 @@ HALF_TOP = 16384.0
 
 
 def group_lamps(power: ArrayLike, most: int = MOST_LAMPS) -> tuple[Array, int]:
-    """Give every emitter a light map of its own, in the order of the emitters, as long as there are at most `most`.
+    """Give every emitter its own light map, in the order of the emitters, if there are at most `most` of them.
 
     Args:
         power: (n,) how much light each emits, >= 0; 0 = none, and it gets no map.

@@ -202,7 +202,7 @@ def segment_mesh(
         scale, min_faces: `scale` and `min_size` of `merge_regions`.
         colour, colour_weight: see `edge_weights`.
         pairs: `face_adjacency(faces, vertices)`, if it is known already.
-        min_area: m^2, about that of a hundred faces of a scan; infinite = the number of faces alone counts.
+        min_area: m^2, about the area of a hundred faces of a scan; infinite = the number of faces alone counts.
 
     Returns:
         (m,) int32 regions from 0 without gaps, in the order of their lowest face; deterministic.

@@ -63,7 +63,7 @@ REACHES = (3.0, 8.0)
 MAX_VIEWS = 24
 """Views of a point that are compared, its own among them: as many as the captures have that the network is trained on."""
 POOL_PIXELS = 40_000
-"""Pixels of a view whose regression enters that of its objects; of more, every second, third, ... row and column."""
+"""Pixels of a view in the pooled regression of its objects. Of more pixels, every second, third, ... row and column counts."""
 MEAN_ALBEDO = 0.4
 """Mean over the surface to which the light is scaled; the network corrects it."""
 KNOWN_SPREAD = 0.3
@@ -237,7 +237,7 @@ def gather_views(
     one_at_a_time = Lock()
 
     def locked(origins: NDArray, directions: NDArray) -> tuple[NDArray, NDArray]:
-        with one_at_a_time:  # it may have threads of its own
+        with one_at_a_time:  # it may use its own threads
             return trace(origins, directions)
 
     def prepared(i: int) -> tuple[ViewTable, ViewLight, Camera]:
@@ -266,7 +266,7 @@ def gather_views(
 def gather_again(gathering: Gathering, views: Views, log_albedo: NDArray, mean_albedo: float = MEAN_ALBEDO) -> Gathering:
     """Estimate the light again, now that the albedo of each object is roughly known; everything else stays.
 
-    The level stays that of `mean_albedo`, with which the network was trained.
+    `mean_albedo`, with which the network was trained, still sets the level.
 
     Args:
         gathering: as `gather_views` returned it.

@@ -155,7 +155,7 @@ class _Steps:
 
 
 def _integrated(steps: list[NDArray], image: NDArray, stay: float) -> NDArray:
-    """Solve Eq. P.14 by the cosine transform (Eq. P.15): (H, W, 3); with weight 0 the mean is that of `image`.
+    """Solve Eq. P.14 by the cosine transform (Eq. P.15): (H, W, 3). With weight 0 the result has the mean of `image`.
 
     `steps` holds the vertical and the horizontal steps, `stay` is the weight of the image.
     """

@@ -88,7 +88,7 @@ def simulate_predictions(
 
     Args:
         albedo: (H, W, 3) linear truth; roughness, metallic: (H, W).
-        object_id: (H, W) int, the units that errors belong to; -1 = none is a unit of its own. samples: K >= 1.
+        object_id: (H, W) int, the units that errors belong to; -1 = none, which is one unit. samples: K >= 1.
         view, seed: any integers; equal ones give equal errors.
         strength: 0 = truth, 1 = the sizes in `errors`, at most 4.
         shading: (H, W) true shading > 0 up to scale (see `shading_proxy`); None = nothing leaks.
@@ -169,7 +169,7 @@ def _truth(albedo: NDArray, roughness: NDArray, metallic: NDArray, shading: NDAr
 
 
 def shading_proxy(radiance: NDArray, albedo: NDArray, object_id: NDArray, sigma: float = 0.02) -> NDArray:
-    """Estimate smooth shading: luminance of radiance over that of albedo, blurred in the logarithm (Eq. P.8).
+    """Estimate smooth shading: mean radiance over mean albedo of the channels, blurred in the logarithm (Eq. P.8).
 
     Highlights are part of it, as they are part of what RGB-X leaks.
 

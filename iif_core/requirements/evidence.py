@@ -10,7 +10,7 @@ FOLDS = 2
 AGAINST = 2.0
 """Standard errors below zero from which a part of the model is left out: missing it costs accuracy, having it costs time."""
 SHRINKAGE = 5.0
-"""Rows of the common scale that each group is given beside its own."""
+"""Rows of the common scale that each group gets in addition to its own rows."""
 _SMALLEST_SCALE = 1e-6  # of the residuals, so that an exact model has a finite likelihood
 
 
@@ -68,7 +68,7 @@ def held_out_evidence(
         simple, full: (n,) held-out residuals; rows that are not finite in either are left out.
         fold: (n,) as `folds_of_blocks` gives it; the residuals of a fold come from a fit to the others.
         block: (n,) ids of what errs together.
-        group: (n,) ids of what has a scale of its own; None = all have one.
+        group: (n,) ids of what has its own scale; None = all rows share one.
 
     Returns:
         The evidence; `NOTHING` with fewer than two blocks.

@@ -132,7 +132,7 @@ def texel_surface(uv: ArrayLike, faces: ArrayLike, size: int) -> tuple[NDArray, 
 
     Args:
         uv: (n, 2) texture coordinates; faces: (m, 3). Charts do not overlap.
-        size: S, which need not be that of the atlas.
+        size: S, which need not be the size of the atlas.
 
     Returns:
         face (S, S) int32, -1 = none, and barycentric coordinates (S, S, 3) float32 of the centre in it, >= 0, of sum 1.

@@ -21,8 +21,10 @@ def values_at(
     values: ArrayLike,
     object_values: ArrayLike,
 ) -> tuple[Array, Array]:
-    """Read the values of the surface at points: of the cell there; where none was observed, the mean of the coarse cell around,
-    then that of the object, and without an object the mean over all objects (docs/method/numerics.md#surface-that-nobody-saw).
+    """Read the values of the surface at points (docs/method/numerics.md#surface-that-nobody-saw).
+
+    A point takes the value of its cell. Where no cell was observed, it takes the mean of the coarse cell around it, otherwise the
+    mean of its object, and without an object the mean over all objects.
 
     Args:
         points: (n, 3) metres.

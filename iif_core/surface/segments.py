@@ -233,8 +233,8 @@ def vote_faces(
 def fill_within(label: NDArray, piece: NDArray, closed: NDArray, adjacency: NDArray) -> NDArray:
     """Label the remaining faces by the pieces of the mesh.
 
-    A face without a label takes that of the nearest labelled face across shared edges, without leaving its piece and without
-    entering a closed face. The faces that remain become one new object per piece, numbered after the others.
+    A face without a label takes the label of the nearest labelled face across shared edges. The search neither leaves the piece
+    nor enters a closed face. The faces that remain become one new object per piece, numbered after the others.
 
     Args:
         label: (F,) int; -1 = no label.

@@ -29,7 +29,7 @@ def clean(faces: NDArray, vertices: NDArray) -> NDArray:
 def simplify(vertices: ArrayLike, faces: ArrayLike, part: ArrayLike, target: int) -> tuple[NDArray, NDArray, NDArray]:
     """Collapse the edges that change the surface least until at most about `target` faces are left.
 
-    Parts are told apart and keep their boundaries; all are simplified together, so that flat ones give up faces first.
+    Parts stay separate and keep their boundaries. All are simplified together, so that flat ones give up faces first.
 
     Args:
         vertices, faces: (n, 3) metres and (m, 3), welded within each part; no vertex is shared by two parts.

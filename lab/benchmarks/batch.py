@@ -1,13 +1,13 @@
 """A batch of a thousand scenes, some of them faulty: `python lab/benchmarks/batch.py [--real 100 --prepared 900]`.
 
-Makes a folder with real scenes (the builtin `tiny`, each with a seed of its own, a few with other settings) and prepared ones,
-which count as finished (tests/workflow/prepared.py). `--faults` of them, by default 3 % of the real ones and at least one of each
+Makes a folder with real scenes (the builtin `tiny`, each with its own seed, a few with other settings) and prepared ones, which
+count as finished (tests/workflow/prepared.py). `--faults` of them, by default 3 % of the real ones and at least one of each
 kind, cannot be finished as they are, or are killed. It then runs `snakemake --cores 2 scenes` to its end, cures the faults, runs
 again, and once more, and judges: every run ends by itself, every scene but the faulty ones is delivered, each fault is named in
 summary.tsv with its cause, the second run delivers the rest, and the third has nothing to do.
 
-It may be killed and goes on with the same command; `--fresh` begins anew. The folder is /tmp/iif-batch, or `--folder`. One row in
-lab/notebook/data/reliability_batch.json with `--keep`; `python lab/benchmarks/reliability.py` makes the page.
+It may be killed; the same command then continues, and `--fresh` begins anew. The folder is /tmp/iif-batch, or `--folder`. With
+`--keep` it writes one row in lab/notebook/data/reliability_batch.json; `python lab/benchmarks/reliability.py` makes the page.
 A full disk (a small tmpfs) needs root; without it that fault is left out.
 """
 

@@ -3,12 +3,12 @@
     python lab/benchmarks/device.py transport [--devices cpu cuda] [--threads 2] [--repeats 5] [--json FILE]
     python lab/benchmarks/device.py priors [--devices cpu cuda] [--json FILE]
 
-`transport` traces the built-in kitchen on each device, in a process of its own with an empty cache of kernels, by the functions
-that the stages call: bare rays, pictures (`render`), cached shading at six roughness levels (`shading`), light maps (`room`) and
-the transport matrix (`emission`). Seconds are those of whole calls, with the copies between NumPy and the device; the first call
-compiles. On CUDA every call is also made with more lanes at once than the CPU has (`chunk`). Then both devices compute the same
-values in independent replicates, which are compared as the study of stability compares renderings, and once with the same random
-numbers.
+`transport` traces the built-in kitchen on each device, in a separate process with an empty cache of kernels. It calls the
+functions that the stages call: bare rays, pictures (`render`), cached shading at six roughness levels (`shading`), light maps
+(`room`) and the transport matrix (`emission`). Seconds are those of whole calls, with the copies between NumPy and the device;
+the first call compiles. On CUDA every call is also made with more lanes at once than the CPU has (`chunk`). Then both devices
+compute the same values in independent replicates, which are compared as the study of stability compares renderings, and once with
+the same random numbers.
 
 `priors` runs random checkpoints of the architectures of RGB-X and Marigold in single and half precision, and measures a U-Net of
 RGB-X's size (866 million random weights).
@@ -208,7 +208,7 @@ def compared(folder: Path) -> dict[str, Any]:
 
 
 def transport(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Measure each device in a process of its own, and compare them."""
+    """Measure each device in a separate process, and compare them."""
     found: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         for kind in arguments.devices:

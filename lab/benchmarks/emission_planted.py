@@ -31,7 +31,7 @@ def information_limit(scene, photographs: np.ndarray, photo_paths: int, paths: l
     own = (group >= 0) & truth[group].any(1)
     halves = sum(scene.transport(1000 + i, 128).matrix[:, 0] for i in range(4)) / 4
     shown = [np.einsum("ngc,gc->nc", a, truth) for a in halves]
-    # A E has noise of its own; what is left of the photographs' alone is told by the numbers of paths.
+    # A E has noise, too. The numbers of paths give the share of the variance that belongs to the photographs alone.
     square = (photographs - 0.5 * (shown[0] + shown[1])) ** 2 / (1 + photo_paths / 1024)
     key = np.stack([scene.room.object_id[scene.face], scene.view, scene.tile], 1)[~own]
     number, block = np.unique(key, axis=0, return_inverse=True)

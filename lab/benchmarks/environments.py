@@ -3,7 +3,7 @@
 python lab/benchmarks/environments.py kitchen here.npz [<capture.pkl>]
 python lab/benchmarks/environments.py --compare here.npz there.npz
 
-The capture is rendered once and kept beside the first result, so that both runs read the same photographs. Without AVX-512:
+The capture is rendered once and kept next to the first result, so that both runs read the same photographs. Without AVX-512:
 
 NPY_DISABLE_CPU_FEATURES="AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR" OPENBLAS_CORETYPE=Haswell \\
 NUMBA_CPU_NAME=haswell NUMBA_CPU_FEATURES=+avx2,+fma,+avx,+sse4.2,+popcnt,+bmi,+bmi2 NUMBA_CACHE_DIR=<an empty folder> python ...

@@ -3,10 +3,14 @@
     python lab/benchmarks/exported.py kitchen modern-hall [--quality draft] [--views 3] [--samples 64] [--replicates 12]
 
 Run it in a working folder where the scenes are finished. For each it prints, and keeps in lab/notebook/data/exported.json:
-faults that Khronos' validator finds; mean differences of the textures in `scene.glb`, read by trimesh, from the values that were
-written, and of what they show from `maps/` of the same views; and the radiance of `mitsuba/` by `render.py` (the exact
-reflectance) and as stock `scene.xml`, over that of the workflow's own renderer: ratio of the means with its standard error, and
-Sidak's test of all pixels. The tables of lab/notebook/exports.md are made anew.
+
+* the faults that Khronos' validator finds;
+* the mean differences of the textures in `scene.glb`, read by trimesh, from the values that were written, and of what the
+  textures show from `maps/` of the same views;
+* the radiance of `mitsuba/` by `render.py` (the exact reflectance) and as stock `scene.xml`, over the radiance of the workflow's
+  own renderer: the ratio of the means with its standard error, and Sidak's test of all pixels.
+
+It also makes the tables of lab/notebook/exports.md anew.
 """
 
 from __future__ import annotations
@@ -40,7 +44,7 @@ const v = require(process.argv[1]), fs = require('fs');
 v.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2]))).then(r => console.log(JSON.stringify(r.issues)));
 """
 EDGE = 0.02
-"""A pixel whose depth differs from that of the photograph's mesh by more than this share shows another surface."""
+"""A pixel whose depth differs from the depth of the photograph's mesh by more than this share shows another surface."""
 
 
 def validated(path: Path) -> dict[str, int]:
@@ -176,8 +180,10 @@ def written(job: Any, colour: np.ndarray, surface: np.ndarray) -> dict[str, floa
 
 
 def rendered(job: Any, unwrapped: Any, views: list[Any], samples: int, replicates: int) -> dict[str, dict[str, float]]:
-    """Radiance of the exported scene over that of our renderer: by the exact and by the stock materials, and, to tell what the
-    textures and the simpler mesh do, by surface cells and by surface cells on the mesh of the photographs."""
+    """Radiance of the exported scene over the radiance of our renderer, by the exact and by the stock materials.
+
+    Two more renderings separate what the textures and the simpler mesh do: one by surface cells, and one by surface cells on the
+    mesh of the photographs."""
     import mitsuba as mi
 
     from iif_core.camera.pinhole import direction_derivatives, pixel_directions

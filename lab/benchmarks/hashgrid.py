@@ -2,7 +2,7 @@
 
     python lab/benchmarks/hashgrid.py --output results/studies/hashgrid.parquet
 
-An iteration is forward, loss, backward and Adam on a batch of points. Every option runs in a process of its own, one
+An iteration is forward, loss, backward and Adam on a batch of points. Every option runs in a separate process, one
 after another, on the same points; first iterations (compilation) are left out, numbers are medians. CPU seconds are
 those of the whole process: on a machine with neighbours they say more than the clock.
 """
@@ -159,7 +159,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, help="Parquet file to write")
     parser.add_argument("--batch", type=int, default=BATCH)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--option", action="append", help=f"only these beside ours: {', '.join(OPTIONS)}")
+    parser.add_argument("--option", action="append", help=f"only these besides ours: {', '.join(OPTIONS)}")
     parser.add_argument("--size", action="append", metavar="LEVELS,LOG2", help="only these; e.g. 32,19")
     parser.add_argument("--row", help=argparse.SUPPRESS)
     arguments = parser.parse_args()

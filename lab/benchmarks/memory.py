@@ -2,9 +2,9 @@
 
     python lab/benchmarks/memory.py <working folder> <scene>[=<name in the table>] ...
 
-What is asked for is what a plan says that knows nothing but the files of the scene (as on a cluster, before its capture is
-there). Peak memory is that of the process (`max_rss_mb` of `benchmarks/<stage>.parts.json`), which the load of the machine does
-not change. The rows go to lab/notebook/data/reliability_memory.json; `reliability.py` makes the table of them.
+The memory asked for is what a plan says that knows nothing but the files of the scene (as on a cluster, before its capture is
+there). The memory taken is the peak of the process (`max_rss_mb` of `benchmarks/<stage>.parts.json`); the load of the machine
+does not change it. The rows go to lab/notebook/data/reliability_memory.json; `reliability.py` makes the table of them.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     python lab/benchmarks/published_memory.py [--pixels 1000000 5300000]
 
-Each size runs in a process of its own. Anonymous memory, the largest of samples every 20 ms, is what the process cannot give
+Each size runs in a separate process. Anonymous memory, the largest of samples every 20 ms, is what the process cannot give
 back; the joined light is mapped from a file without a name in the working folder, whose pages the system takes back when
 something else needs them. One pass over the pixels in steps of 32,768, and the loss of all of them at its end.
 """

@@ -31,7 +31,7 @@ BRIGHT = 0.9
 CLIPPED = 254
 """Pixels with a channel of at least this are left out."""
 EDGE = 0.01
-"""Points whose distance from the eye differs from that of the photographs' mesh by more than this share are left out."""
+"""Points are left out if their distance from the eye differs from the photographs' mesh by more than this share."""
 DIM = 0.05
 """Errors of texels are relative to their light, or to this share of the mean if that is more."""
 SLIDES = 12
@@ -154,7 +154,7 @@ def traced(job: Any, document: dict[str, Any], facts: dict[str, np.ndarray], sam
 
 
 def texel_errors(job: Any, stored: Any, asked: argparse.Namespace) -> list[dict[str, float]]:
-    """For each lamp, how far the stored light of single texels that photographs show is from that of many whole paths there."""
+    """For each lamp, errors of the stored light of single texels that photographs show, against many whole paths there."""
     from iif_core.light.transport.lightmaps import light_maps
     from iif_core.light.transport.scene import PathOptions
     from workflow.exporters.atlas import bake, read_parts, texels_of

@@ -3,12 +3,12 @@ near its rays come to the rate at which the mesh can be traced at all, and its l
 
     python lab/benchmarks/stage_profile.py kitchen [--quality draft] [--threads 2] [--stages base emission] [--rays] [--loops]
 
-Run it in a working folder where the scene is finished; each stage is made again, in a process of its own, and writes the same
-files. Prints a table for lab/notebook/performance.md. Seconds of wall time under Python's profiler, which slows Python code by
+Run it in a working folder where the scene is finished. Each stage runs again, in a separate process, and writes the same files.
+Prints a table for lab/notebook/performance.md. Seconds of wall time under Python's profiler, which slows Python code by
 some ten percent; CPU seconds are those of the process. Start: the interpreter and the imports before the stage begins.
 
-With `--rays` each stage that traces is made once more to count its rays, nearest hits and tests of visibility alike, and the rate
-of its kernels is compared with that of rays of random directions from visible surface, traced without anything else.
+With `--rays` each stage that traces runs once more to count its rays, nearest hits and tests of visibility alike. The rate of its
+kernels is compared with the rate of rays of random directions from visible surface, traced without anything else.
 
 With `--loops` the compiled loops of the direct solvers of `base` and `affines` are timed on one thread, the first call of each
 left out, because it loads compiled code. The size of the arrays that a call is given over its time, relative to the rate at
@@ -40,7 +40,7 @@ PARTS = {
     "Parquet": (("files.py", "read_parquet"), ("files.py", "write_parquet")),
     "imports": (("<frozen importlib._bootstrap>", "_find_and_load"),),
 }
-"""Part -> functions (end of the file's name, function) whose time with everything below is that of the part."""
+"""Part -> functions (end of the file's name, function). Their time, with everything below, is the time of the part."""
 COLUMNS = ("seconds", "cpu", "start", *PARTS, "compiling", "kernels", "rest")
 TRACING = ("capture", "emission", "shading", "render")
 BARE_RAYS = 1 << 20

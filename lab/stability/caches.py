@@ -2,7 +2,7 @@
 
 Stages are run with few and with many paths on one capture, each with several seeds. The difference of the means is the bias,
 and its standard error comes from the seeds. Diffuse light is a mean of paths and must have none; adding paths only where the
-halves of a cell differ could bring one, and is a case of its own. The power comes from least squares whose matrix is noisy.
+halves of a cell differ could bring one, and is a separate case. The power comes from least squares whose matrix is noisy.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ class FreeJob(Job):
     """A job whose settings are given and whose folders are not those of a scene; it checks no fingerprints."""
 
     def __init__(self, stage: str, folder: Path, document: dict[str, Any], threads: int = 1):
-        # Not that of Job, which looks a scene up.
+        # `Job.__init__` is not called, because it looks a scene up.
         self.stage, self.scene, self.quality, self.threads = STAGES[stage], "free", "draft", threads
         self.log = logging.getLogger(stage)
         self.document, self._folder = document, folder

@@ -3,7 +3,8 @@
 Photographs, depths, mesh and cameras of a capture are moved by at most one unit in the last place of their formats, each number
 up, down or not at all by chance; in other series the predictions are, which have half precision, and 8-bit photographs by at most
 one grey level (linear ones by their rounding to half precision). Of each output the number of significant digits is
--log10(spread / |mean|) over the runs (Parker 1997), and the amplification is its relative change over that of what was moved.
+-log10(spread / |mean|) over the runs (Parker 1997). The amplification is the relative change of the output over the relative
+change of what was moved.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class Digits(NamedTuple):
     Attributes:
         room, moved: which capture, and what was moved; stage, column: the output.
         median, low: median over the pixels, and the digits that `SHARE` of them have; enough: share with `ENOUGH` digits.
-        amplification: root mean square of the relative change over that of the input that was moved most.
+        amplification: root mean square of the relative change, over the same of the input that was moved most.
     """
 
     room: str

@@ -1,4 +1,4 @@
-"""The elementwise kernels of the project beside their formulas in mpmath: what `lab.stability.scalar` measures."""
+"""The elementwise kernels of the project with their formulas in mpmath: what `lab.stability.scalar` measures."""
 
 from __future__ import annotations
 

@@ -172,7 +172,7 @@ def _alone(parts: Sequence[Part], origin: NDArray, ways: NDArray) -> NDArray:
 
 
 def extremes(size: int = 32) -> dict[str, Room]:
-    """Return rooms with heavy tails: a lamp of 4 cm^2 and radiance 10^6, without and with a mirror (r = 0.02) beside it."""
+    """Return rooms with heavy tails: a lamp of 4 cm^2 and radiance 10^6, without and with a mirror (r = 0.02) next to it."""
     shell = Part(*_box((0, 0, 0), (4, 3, 2.5), inward=True), (0.6, 0.6, 0.6, 0.8, 0.0))
     lamp = Part(*_quad((2.0, 1.5, 2.4), (0, 0.02, 0), (0.02, 0, 0)), _BLACK, (1e6, 1e6, 1e6))
     mirror = Part(*_box((0.6, 1.2, 0.0005), (1.4, 2, 0.9)), (0.9, 0.9, 0.9, 0.02, 1.0))

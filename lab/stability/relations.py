@@ -2,8 +2,8 @@
 
 Every relation changes photographs, cameras, mesh and predictions together so that they show the same room as before, runs all
 stages on them, and undoes the change in the result. What remains is compared with the spread of the same room under other
-seeds, because most changes make rays and pixels meet other random numbers, and with that of a capture moved by a part of a
-cell, because cells that lie elsewhere average other pixels.
+seeds, because most changes make rays and pixels meet other random numbers. It is also compared with the spread of a capture moved
+by a part of a cell, because cells that lie elsewhere average other pixels.
 """
 
 from __future__ import annotations
@@ -301,7 +301,7 @@ def _unwelded(capture: Capture, rng: np.random.Generator) -> Capture:
 
 
 def _hidden_added(capture: Capture, rng: np.random.Generator) -> Capture:
-    """A small box far outside, which nothing sees; it is an object of its own."""
+    """A small box far outside, which nothing sees; it is a separate object."""
     low = capture.vertices.min(0) - 3.0
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32) * 0.5 + low.astype(np.float32)
     sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]

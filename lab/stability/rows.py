@@ -89,7 +89,7 @@ def of_orders(found: Iterable[Order]) -> Iterator[Row]:
 
 
 def of_relations(found: Iterable[Related]) -> Iterator[Row]:
-    """Rows of the relations: how far the result is from that of the unchanged capture; no limit where that is explained."""
+    """Rows of the relations: distance of the result from the result of the unchanged capture; no limit where it is explained."""
     for one in found:
         for name, value, most in zip(one.found._fields, one.found, one.allowed, strict=True):
             yield _row("relations", one.room, one.yardstick, one.relation, name, value, most, one.explained)

@@ -20,7 +20,7 @@ from workflow.runtime import device
 
 LEVEL = 0.05
 FEWEST = 5.0
-"""Draws that a cell of its own must expect."""
+"""Expected draws below which a cell is merged with others."""
 DRAWS = 1 << 20
 ROWS, COLUMNS, FINE = 24, 32, 40
 """Cells of directions by cosine and azimuth, and points of the quadrature along each edge of a cell."""

@@ -1,7 +1,7 @@
 """Which error of the input, and which setting, costs most accuracy: elementary effects after Morris.
 
 Every factor has four levels from good to bad (input) or from dear to cheap (settings). Errors of cameras and mesh are errors of
-what the stages are told: photographs stay, and depth and faces are traced anew through the wrong mesh from the wrong place.
+what the stages are given: photographs stay, and depth and faces are traced anew through the wrong mesh from the wrong place.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 For a computed answer x of H x = b, the normwise backward error is |H x - b| / (|H| |x| + |b|), the smallest relative change of H
 and b that makes x exact. Non-negative solutions are judged by the optimality conditions on the same scale. The forward error is
-that of x against the planted or exact answer; divided by condition x eps it is the growth, of order 1 for a stable method.
+the error of x against the planted or exact answer. Divided by condition x eps it is the growth, of order 1 for a stable method.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Sheets of pictures for papers: methods beside each other, a row a room and quantity (docs/development/studies.md#sheets).
+"""Sheets of pictures for papers: methods side by side, one row for each room and quantity (docs/development/studies.md#sheets).
 
 Everything comes from stages that are finished; a variant that is not has no column, and nothing is computed.
 """
@@ -34,7 +34,7 @@ LETTERS = 7.0
 LETTER = 0.0093
 """Width of a letter of one point in inches."""
 LIGHTS = {"lamp": "one lamp", "moved": "a moved lamp", "environment": "an environment", "sphere": "a glowing sphere"}
-"""Kinds of light of a study of relighting, in words."""
+"""Kinds of light of a study of relighting, as text."""
 DPI = 200
 
 

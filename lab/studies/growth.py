@@ -31,8 +31,10 @@ def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
 
 
 def growth_lines(study: Study, shown: pd.DataFrame, scenes: list[str]) -> list[str]:
-    """Return a block of Markdown for each scene and each thing that is varied: a row for each stage, with its cost at each size
-    (mean over the seeds), the exponent over all of them, and that of the last doubling."""
+    """Return a block of Markdown for each scene and each thing that is varied.
+
+    A row for each stage holds its cost at each size (mean over the seeds), the exponent over all sizes, and the exponent of the
+    last step."""
     lines: list[str] = []
     for scene in scenes:
         own = shown[shown["scene"] == scene].drop_duplicates(["variant", "seed"])

@@ -62,7 +62,7 @@ class Kept(NamedTuple):
 
     @property
     def in_range(self) -> bool:
-        """Whether it is within a factor of two of the range, up to two standard errors of its own."""
+        """Whether the gain is within a factor of two of the range, up to two standard errors of the gain."""
         low, high = self.claimed
         low *= 1 / WITHIN if low > 0 else WITHIN
         high *= WITHIN if high > 0 else 1 / WITHIN
@@ -146,7 +146,7 @@ def _seeds_that_differ(value_of: pd.Series, scene: str, reference: str, variant:
 def _differences(
     value_of: pd.Series, scene: str, pair: tuple[str, str], seeds: Iterable[int], score: tuple[str, str, str]
 ) -> list[float]:
-    """Value of the first variant minus that of the second, seed by seed, where both have the score."""
+    """Value of the first variant minus the value of the second, seed by seed, where both have the score."""
     out = []
     for seed in seeds:
         both = [value_of.get((scene, variant, seed, *score), math.nan) for variant in pair]

@@ -171,7 +171,7 @@ def keep_rows(name: str, quality: str, path: Path) -> None:
 
     Args:
         name: of the study; quality: of its runs.
-        path: the file, with the columns `KEPT`; `fingerprint` is that of the stage that scored the cell.
+        path: the file, with the columns `KEPT`; `fingerprint` is the fingerprint of the stage that scored the cell.
     """
     import pandas as pd
 
@@ -313,7 +313,7 @@ def page(study: study_files.Study, frame: pd.DataFrame, skipped: dict[str, str])
         note += "; variants with further seeds have the standard deviation over them"
     if study.reference:
         label = study.variants[study.reference].label or study.reference
-        lines += [f"In brackets: by how much a number moves from that of *{label}* with the same seed.", ""]
+        lines += [f"In brackets: by how much a number differs from *{label}* with the same seed.", ""]
     explained = "; ".join(f"*{PROTOCOLS[protocol].short}*: {PROTOCOLS[protocol].explanation}" for protocol in study.protocols)
     lines += [f"{note}. {explained}. The paper's numbers are of other scenes; in brackets the protocol that they follow.", ""]
     front = study.plot.kind == "pareto"

@@ -214,7 +214,7 @@ def test_the_cuda_builds_need_more_and_all_of_it_by_hash(copy, index, tmp_path):
 
 
 def test_a_build_that_is_not_listed_is_refused_unless_it_is_chosen(copy, index):
-    """Before anything is downloaded; a choice is told that it comes without a hash."""
+    """It is refused before any download. If it is chosen, a message says that it comes without a hash."""
     environment = index("+cu126", listed=False)
     result = run(["bash", "envs/setup.sh"], copy, environment)
     assert result.returncode == 1 and len(result.stderr.strip().splitlines()) == 1

@@ -26,7 +26,7 @@ def test_every_lock_has_hashes_and_they_fit_together(repository):
         for block in re.split(r"^(?=[A-Za-z0-9])", (repository / "envs" / lock).read_text(), flags=re.M)[1:]:
             name, version = re.match(r"([\w.-]+)==([^\s\\]+)", block).groups()
             assert re.search(r"--hash=sha256:[0-9a-f]{64}\b", block), (lock, name)
-            if lock != "docs.txt":  # an environment of its own
+            if lock != "docs.txt":  # it has its own environment
                 assert versions.setdefault(name, version) == version, (lock, name)
     assert f"torch=={versions['torch']}\n" in (repository / "envs/requirements.in").read_text()
     text = (repository / "envs/torch.lock").read_text()
@@ -76,7 +76,7 @@ def test_the_image_is_built_and_works(repository, tmp_path):
 
 
 def test_an_image_check_that_cannot_be_says_why(repository, tmp_path, clean_environment):
-    """Engines that reach no registry count as none; so CI goes on."""
+    """Engines that reach no registry count as none, so CI continues."""
     for engine in ("docker", "podman"):
         (tmp_path / engine).write_text("#!/bin/sh\nexit 1\n")
         (tmp_path / engine).chmod(0o755)

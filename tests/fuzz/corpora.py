@@ -410,7 +410,7 @@ def read_mitsuba_scene() -> None:
 
 
 def load_mitsuba_scene() -> None:
-    """As stage `capture` first does, in a process of its own, which Mitsuba may end; what it raised there is raised here."""
+    """Load as stage `capture` first does: in a separate process, which Mitsuba may end. An error there is raised here."""
     from workflow.sources.mitsuba_scene import scene, trial
 
     read_mitsuba_scene()

@@ -565,7 +565,7 @@ def placed_wrong(rng: Random, path: Path) -> str:
 
 
 def mutate(rng: Random, folder: Path, files: tuple[str, ...]) -> str:
-    """Change one or two of the files in a folder; returns in words what was done."""
+    """Change one or two of the files in a folder; return as text what was done."""
     done = []
     pristine = [(folder / name).read_bytes() for name in files]
     for _ in range(1 if rng.random() < 0.85 else 2):

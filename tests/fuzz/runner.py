@@ -1,4 +1,4 @@
-"""Reads changed files as a run does, each in a process of its own with limits on time and memory, and says what became of them.
+"""Reads changed files as a run does, in forked processes with limits on time and memory for each case, and reports the outcomes.
 
 `python -m tests.fuzz.runner --cases 100000 --seed 0 --jobs 2`, or `make fuzz`. Whatever a file holds, a reader must either accept
 it or refuse it with one clear message (`InputError`). Everything else is a failure: another exception, a signal, more time or
@@ -191,7 +191,7 @@ def _child(cases: list[tuple[str, int]], seed: int, pristine: Pristine, home: Pa
         answer = json.dumps(found).encode() + b"\n"
         while answer:
             answer = answer[os.write(send, answer) :]
-        if found["verdict"] == "memory":  # the peak of this process would hide that of the next case
+        if found["verdict"] == "memory":  # the peak of this process would hide the peak of the next case
             return
 
 
@@ -287,7 +287,7 @@ def ready(targets: dict[str, Target] = TARGETS) -> Iterator[Run]:
         yield run
         gc.unfreeze()
         sys.dont_write_bytecode = before[1]
-        if before[0]:  # that of other tests in this process
+        if before[0]:  # the variant of other tests in this process
             mitsuba.set_variant(before[0])
 
 
@@ -299,7 +299,7 @@ def _worker(cases: list[tuple[str, int]], seed: int, run: Run, out: Path) -> Non
 
 
 def fuzz(cases: list[tuple[str, int]], seed: int, jobs: int, tell: float = 60.0) -> list[Result]:
-    """Run cases in `jobs` processes beside each other."""
+    """Run cases in `jobs` parallel processes."""
     with ready() as run, tempfile.TemporaryDirectory(prefix="iif-fuzz-results-") as folder:
         places = [Path(folder) / f"{i}.jsonl" for i in range(jobs)]
         children = []

@@ -148,7 +148,7 @@ def test_variants_share_what_an_earlier_one_made(folder):
     # What depends on the variant but not on the seed is made once.
     folder("studies/late", LATE.replace("base: {ridge: 0.5}", "capture: {views: 3}"))
     assert home("far", 1, "capture") == "t--late-far-s0" and home("far", 1, "prior") == "t--late-far-s1"
-    assert len(study_table.inputs("late", "draft")) == 6  # `same` needs nothing of its own
+    assert len(study_table.inputs("late", "draft")) == 6  # `same` adds nothing
 
 
 def test_a_study_does_not_move_with_what_draft_is(folder):

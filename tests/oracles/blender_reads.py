@@ -1,4 +1,4 @@
-"""What Blender reads of an exported glTF file. This runs in a Python of its own that has Blender's module `bpy`:
+"""What Blender reads of an exported glTF file. This runs in a separate Python that has Blender's module `bpy`:
 
     python blender_reads.py REQUEST.json
 
@@ -62,7 +62,7 @@ def emission():
 
 
 def show(quantities):
-    """Let every material emit inputs of its own surface: one colour, or up to three numbers."""
+    """Let every material emit inputs of its surface: one colour, or up to three numbers."""
     for material in bpy.data.materials:
         if not material.use_nodes:
             continue

@@ -10,7 +10,7 @@ from iif_core.fusion.hashgrid.texture import HashGridTexture
 
 
 class TorchTexture(HashGridTexture):
-    """Texture on tensors; the graph's `backward` calls that of the texture."""
+    """Texture on tensors; the graph's `backward` calls the texture's `backward`."""
 
     def __call__(self, u: torch.Tensor) -> torch.Tensor:
         return _Graph.apply(torch.zeros((), requires_grad=True), u, self)

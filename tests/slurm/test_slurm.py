@@ -1,7 +1,7 @@
 """The Slurm profiles on a real Slurm of one node, with or without accounting: tests/slurm/run.sh starts it (`make test-slurm`).
 
-`IIF_SLURM_SCENE=kitchen bash tests/slurm/run.sh -k overhead` measures what a job for a scene costs beside its stages, and keeps
-the row for lab/notebook/reliability.md; it wants a machine that does nothing else, and takes two drafts of the scene.
+`IIF_SLURM_SCENE=kitchen bash tests/slurm/run.sh -k overhead` measures what a job for a scene costs in addition to its stages,
+and keeps the row for lab/notebook/reliability.md. It needs a machine that does nothing else, and takes two drafts of the scene.
 """
 
 import csv
@@ -83,7 +83,7 @@ def local(batch):
 
 
 def submit(folder, name, blocks, seconds, *options):
-    """Submit a job that takes memory and time as told; its id."""
+    """Submit a job that takes the given memory and time; return its id."""
     log = folder / f"{name}-%j.out"
     program = f"{REPOSITORY}/.venv/bin/python"
     (folder / "hog.py").write_text(HOG)
@@ -137,8 +137,8 @@ def keep(**facts):
 
 
 def test_a_batch_survives_a_cancelled_job_and_a_killed_controller(batch, local):
-    """One job for each scene. Every manifest equals that of the run without Slurm, the run says what happened to the cancelled
-    job, and nothing is left in the queue."""
+    """One job for each scene. Every manifest equals the one of the run without Slurm, the run reports what happened to the
+    cancelled job, and nothing is left in the queue."""
     folder = batch("slurm")
     process = subprocess.Popen(
         command(folder, "--workflow-profile", PROFILES / "slurm-scenes", "--jobs", 2, "scenes"),

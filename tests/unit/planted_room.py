@@ -50,8 +50,8 @@ class Room:
 
 
 def build_room(variant: int = 0, coarse: bool = False) -> Room:
-    """Variants differ in colours, furniture and light. `coarse`: nine groups that are told apart well: three rows of the
-    window, two ceiling lights, the lamp, and the three that do not shine."""
+    """Variants differ in colours, furniture and light. `coarse` makes nine groups that are easy to separate: three rows
+    of the window, two ceiling lights, the lamp, and the three that do not shine."""
     rng = np.random.default_rng(variant)
     x, y, z = SIZE
     walls = [

@@ -336,7 +336,7 @@ def test_covariance_is_of_the_right_size():
 
 @pytest.mark.parametrize("as_metal, kind", [(1.0, 1), (4.0, 0), (0.2, 0)])
 def test_a_metal_must_be_as_bright_as_its_base_suggests(as_metal, kind):
-    """The photographs prefer a metal a little; it is refused if its albedo would be several times that of its base."""
+    """The photographs slightly prefer a metal; it is refused if its albedo would be far brighter or darker than its base."""
     objects, base = 8, np.full((8, 5), 0.4)
     cost = np.full((objects, 3, len(ROUGHNESS_GRID)), np.inf)
     cost[:, 0] = 5.0
@@ -372,7 +372,7 @@ def test_the_base_tells_which_of_two_objects_is_rougher(slope, tells):
 
 
 def test_what_is_as_likely_at_every_roughness_stays_so():
-    """Without evidence the posterior stays that of the first histogram, which is flat: smoothing loses nothing at its ends."""
+    """Without evidence the posterior stays as flat as the first histogram: smoothing loses nothing at its ends."""
     cost = np.full((30, 3, len(ROUGHNESS_GRID)), np.inf)
     cost[:, 0] = 0.0
     found = chosen(cost, np.zeros((*cost.shape, 16)), np.full((30, 5), 0.4))

@@ -262,7 +262,7 @@ LINKS = (
 
 @pytest.mark.parametrize("link", LINKS)
 def test_nothing_is_made_where_a_link_leads_out(tmp_path, monkeypatch, link):
-    """Results of a stranger: neither a plan nor a job goes on, and what is behind the link stays as it is."""
+    """The results come from a stranger: neither a plan nor a job continues, and what is behind the link stays as it is."""
     monkeypatch.chdir(tmp_path)
     outside = Path("own/notes.txt")
     outside.parent.mkdir()

@@ -140,7 +140,7 @@ def test_closest_points():
 
 
 def test_tangents_point_to_u_and_components_come_back():
-    """A slanted quad whose texture is turned and mirrored: t is the direction of +u, b that of -v, for both handednesses."""
+    """A slanted quad with a turned and mirrored texture: t points towards +u and b towards -v, for both handednesses."""
     vertices = np.array([[0, 0, 0], [2, 0, 1], [2, 3, 1], [0, 3, 0.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     normal = np.cross([2, 0, 1], [0, 3, 0]) / np.linalg.norm(np.cross([2, 0, 1], [0, 3, 0]))

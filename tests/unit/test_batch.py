@@ -159,8 +159,8 @@ def test_overrides_are_yaml_values_under_dotted_keys():
         ("capture..views=3", ["key=value", "dotted"]),
         ("capture.views=3;capture.views=4", ["'capture.views' stands twice"]),
         ("prior={kind: retinex};prior.samples=3", ["'prior' and 'prior.samples' set the same thing"]),
-        ("source.path=x", ["'source.path'", "column of its own, path"]),
-        ("source.kind=folder", ["column of its own, source"]),
+        ("source.path=x", ["'source.path'", "its own column, path"]),
+        ("source.kind=folder", ["its own column, source"]),
         ("seed=[1", ["'seed'", "not a YAML value"]),
     ],
 )
@@ -434,7 +434,7 @@ def test_the_page_links_to_what_is_here_and_escapes_what_it_is_told(five):
 
 
 def test_a_deliverable_that_was_changed_is_not_done(five, monkeypatch):
-    """Scores and verdict are read from its files, so none of them is told."""
+    """Scores and verdict are read from its files, so the table reports none of them."""
     lines = ("scenes/done/verdict.json: its content changed", "scenes/done/scene.glb: missing")
     monkeypatch.setattr(batch_plan, "plan", lambda quality: replace(five, damaged={"done": lines}))
     summary.write_summary("draft")
@@ -484,7 +484,7 @@ def test_pictures_show_what_the_report_shows(project, dynamic_range, photograph,
     for i, value in enumerate((photograph, rendered, 188)):
         assert np.abs(picture[:, i * (100 + GAP) :][:, 8:92] - value).max() <= 3
     write_exr(Path("scenes/a/maps/001.exr"), {**channels, "ldr.R": np.full((4, 300), 0.9, np.float32)})
-    assert write_pictures(["a"], folder) == {"a": first}  # that of the same result is not made again
+    assert write_pictures(["a"], folder) == {"a": first}  # the picture of the same result is not made again
     write_json(Path("scenes/a/manifest.json"), {"fingerprint": "second"})
     (second,) = write_pictures(["a"], folder).values()
     assert [path.name for path in (folder / "pictures").iterdir()] == [Path(second).name] and second != first

@@ -1,4 +1,4 @@
-"""What lies beside the scene for other programs: objects.csv, cameras.json, photographs, response, attributes of EXR files."""
+"""What lies next to the scene for other programs: objects.csv, cameras.json, photographs, response, attributes of EXR files."""
 
 import io
 import json

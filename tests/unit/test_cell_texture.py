@@ -67,7 +67,7 @@ def test_cells_without_pixels_keep_their_base():
 
 
 def test_what_is_off_everywhere_alike_moves_no_cell():
-    """An error of the level is left to the light, also at cells that hardly a photograph shows beside others that many do."""
+    """An error of the level is left to the light, even where hardly any photograph shows a cell, next to cells that many show."""
     ijk, owner, points, pairs = _plane(side=20)
     base = np.full((len(ijk), 3), 0.5)
     for little in (0.0, 0.1):

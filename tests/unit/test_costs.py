@@ -86,8 +86,8 @@ def test_the_range_is_that_of_rooms_that_were_not_seen():
 
 
 def test_memory_follows_one_photograph_and_is_judged_by_sizes_that_were_not_seen():
-    """What is held at once is a photograph, whatever their number; times know nothing of that count. A room that alone tells what
-    pixels cost is left out size by size, so that the range is that of its sizes."""
+    """A job holds one photograph at a time, whatever their number; times do not depend on the size of one photograph. If a single
+    room shows what pixels cost, it is left out size by size, so that the range comes from its sizes."""
     rows = planted(rooms=4)
     for i, row in enumerate(rows):
         row["a_view"] = (0.1, 0.4)[i % 2]
@@ -258,7 +258,7 @@ def test_what_snakemake_is_told():
     fits = {("render", "all", name): model.Fit({"job": 100.0}, 0.5, 2.0, 9, 3) for name in model.MEASURES}
     cost = model.predict("render", Work("all", {"job": 1.0}), 2, 1.0, fits)
     assert forecast.memory_mb(cost) == 250 and forecast.disk_mb(cost) == 200
-    assert forecast.memory_mb(cost, on_node=True) == 400  # with the Snakemake beside it
+    assert forecast.memory_mb(cost, on_node=True) == 400  # with the Snakemake next to it
     assert forecast.minutes(cost) == forecast.TIME_LEAST + 14
     nothing = model.Cost(None, None, None, None)
     told = forecast.memory_mb(nothing), forecast.minutes(nothing), forecast.disk_mb(nothing)

@@ -60,7 +60,7 @@ def test_a_device_that_cannot_trace_rays(monkeypatch, caplog):
 
 
 CHOOSERS = {"runtime/device.py", "runtime/doctor.py", "exporters/mitsuba_render.py", "sources/mitsuba_scene/trial.py"}
-"""The last three are programs of their own: a probe in a child process, what is exported beside scene.xml, and the loading of a
+"""The last three are separate programs: a probe in a child process, what is exported next to scene.xml, and the loading of a
 scene that may end its process."""
 
 

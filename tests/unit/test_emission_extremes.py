@@ -103,7 +103,7 @@ def test_a_saturated_or_black_view(everything):
 
 
 def test_coincident_and_flipped_faces():
-    """A lamp modelled twice, once with its faces turned round: two groups of opposite side, sharing what is not told apart."""
+    """A lamp modelled twice, once with flipped faces: two groups of opposite side share light that cannot be separated."""
     faces, _ = _strip(2)
     both = np.concatenate([faces, faces[:, ::-1] + 6])
     stats = face_statistics(
@@ -135,7 +135,7 @@ def test_one_object_and_five_thousand(objects):
 
 
 def test_emitter_that_is_never_seen_is_left_to_its_light():
-    """No pixel of its own: no white surface to compare with, and no reason to drop it while it has power."""
+    """It has no pixels, so there is no white surface to compare with, and no reason to drop it while it has power."""
     a, truth = _matrix(1000, 2), np.array([5.0, 4.0])[:, None] * np.ones(3)
     y = np.einsum("ngc,gc->nc", a, truth)
     group = np.where(np.arange(1000) < 50, 0, -1)

@@ -221,8 +221,8 @@ def test_gradient_is_cut_into_steps():
 
 
 def test_a_curtain_is_one_lamp_however_its_folds_fall():
-    """Folds of alternating brightness and normals: dark ones are not bright by themselves, the curtain is; the wall beside it,
-    with one bright face, is not."""
+    """Folds of alternating brightness and normals: dark folds are not bright by themselves, but the curtain is. The wall next to
+    it, with one bright face, is not."""
     vertices, faces = _strip(20)
     vertices[:, 2] = 0.8 * (np.arange(len(vertices)) % 21 % 2)  # folds of nearly 40 degrees
     normals, areas = face_geometry(vertices, faces)
@@ -248,7 +248,7 @@ def test_a_curtain_is_one_lamp_however_its_folds_fall():
 
 
 def test_a_lamp_that_is_cut_into_many_objects_stays_one():
-    """Six quads of one lamp, each an object that glows by itself, beside a dark wall."""
+    """Six quads of one lamp, each an object that glows by itself, next to a dark wall."""
     vertices, faces = _strip(20)
     normals, areas = face_geometry(vertices, faces)
     object_id = np.repeat([*range(1, 7), *[0] * 14], 2)

@@ -26,7 +26,7 @@ def test_planted_groups_are_recovered(planted, kind, median):
 
 
 def test_what_is_never_seen_unsaturated_is_known_by_its_light(planted):
-    """Single triangles are not told apart by so few paths; the light of each object is."""
+    """So few paths do not separate single triangles, but they determine the light of each object."""
     scene, photographs, _ = planted
     problem, initial = scene.problem(photographs, scene.transport(1, 32), "ldr_one")
     found = solve_families(problem.rows, EmissionPrior.independent(initial), scene.families())

@@ -105,8 +105,8 @@ def test_pixels_on_a_group_as_if_it_reflected():
 
 def _room(strip, reflects=0.1, seed=3):
     """A ceiling and four other objects under a lamp in sight (column 0) and a strip that no camera sees (column 2). Column 1 is a
-    patch of the ceiling beside the strip that looks like a lamp, and column 3 unseen surface that is dark. The light of the patch
-    on the other rows is what it reflects. A white surface in the place of hidden ones would show `reflects`."""
+    patch of the ceiling next to the strip; the patch looks like a lamp. Column 3 is unseen surface that is dark. The light of the
+    patch on the other rows is what it reflects. A white surface in the place of hidden ones would show `reflects`."""
     rng = np.random.default_rng(seed)
     n, lamp, e = 4000, 6.0, 9.0 * strip
     owner = rng.integers(0, 5, n)

@@ -230,7 +230,7 @@ def _pruning(shown, seen, matrix, noise=0.05, seed=9, family=None, reach=None):
 
 
 def test_pruning_keeps_what_shines():
-    """A lamp; a lit wall beside it; a strip brighter than white but without power; a dark group; the environment."""
+    """A lamp; a lit wall next to it; a strip brighter than white but without power; a dark group; the environment."""
     matrix = np.zeros((5, 5))
     matrix[1, 0] = 0.4  # a white surface there would show 0.4 of the lamp
     out = _pruning([8.0, 2.0, 2.0, 0.0, 1.0], [8.0, 2.0, 2.0, 0.0, 0.0], matrix, reach=[1.0, 1.0, 1e-3, 1.0, 1.0])
@@ -273,7 +273,7 @@ def test_wall_that_is_dropped_keeps_reflecting():
     ids=["brighter than white", "without light", "no brighter than white"],
 )
 def test_what_was_dropped_may_shine_if_it_is_brighter_than_white_and_gives_light(white, reach, offered):
-    """A window of radiance 4 beside a lamp of 8, under which a white surface in its place would show 2.4 or 4.8."""
+    """A window of radiance 4 next to a lamp of 8. In this light a white surface in the window's place would show 2.4 or 4.8."""
     matrix = np.zeros((3, 3))
     matrix[1, 0] = white
     out = _pruning([8.0, 4.0, 0.0], [8.0, 4.0, 0.0], matrix, reach=[1.0, reach, 1.0])
@@ -454,7 +454,7 @@ def test_colour_of_the_light_is_weighed_against_that_of_the_base(contrast, least
         return gain - gain.mean(), np.array(found.colour_moved)
 
     (plain, unmoved), (weighed, moved) = cast(None), cast(BaseAlbedo(base))
-    # The colour of the light moves against that of the gains, by no more than they allow.
+    # The colour of the light moves against the colour of the gains, by no more than they allow.
     assert not unmoved.any() and moved @ (weighed - plain) < 0
     assert np.abs(plain).max() > 0.02
     assert least < np.linalg.norm(weighed) / np.linalg.norm(plain) < most

@@ -506,7 +506,7 @@ def test_a_smaller_texture_stays_in_its_place(side):
     surface = np.asarray(Image.open(io.BytesIO(binary[start : start + image["byteLength"]])), np.float64)
     at = (np.arange(len(surface)) + 0.5) / len(surface)
     for channel, axis in ((1, 0), (2, 1)):  # roughness changes along columns, metallic along rows
-        profile = np.maximum(surface[..., channel].mean(axis) - 30, 0)  # JPEG leaves ripples beside the hill
+        profile = np.maximum(surface[..., channel].mean(axis) - 30, 0)  # JPEG leaves ripples next to the hill
         assert (profile * at).sum() / profile.sum() == pytest.approx(0.37, abs=0.2 / side)
 
 

@@ -114,7 +114,7 @@ print([name for name in ("numba", "torch", "mitsuba", "scipy", "open3d") if name
 
 
 def test_closure_covers_what_a_stage_really_imports(repository):
-    """Import every stage (with every plug-in) in a process of its own; nothing of ours may be loaded that the digest misses."""
+    """Import every stage (with every plug-in) in a separate process; it must load nothing of ours that the digest misses."""
     # The processes are forks of one that holds the libraries, which take most of the time.
     probe = textwrap.dedent(
         """

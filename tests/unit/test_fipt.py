@@ -141,7 +141,7 @@ def test_synthetic_photographs_exposures_and_response(tmp_path):
     np.testing.assert_allclose(curve, np.linspace(0, 1, 101) ** np.array([[0.4], [0.5], [0.6]]), atol=2e-3)
     for view in capture:
         photo, _ = capture.photo(view, held_out=True)
-        radiance = capture.truth(view).radiance  # of the EXR beside the photograph
+        radiance = capture.truth(view).radiance  # of the EXR next to the photograph
         np.testing.assert_allclose(own.pattern(capture.points(view, capture.gbuffer(view)[0])), radiance, atol=1e-3)
         exposed = np.clip(view.exposure * radiance, 0, 1)
         np.testing.assert_allclose(photo, exposed ** np.array([0.4, 0.5, 0.6]), atol=0.5 / 255 + 1e-3)

@@ -522,7 +522,7 @@ def test_agreement_of_a_few_pixels_by_chance_does_not_count():
 
 
 def test_depth_of_another_camera(tmp_path):
-    """A depth sensor 5 cm beside the camera, with other intrinsics, is compared at the points that it sees."""
+    """A depth sensor 5 cm to the right of the camera, with other intrinsics, is compared at the points that it sees."""
     from iif_core.camera.distortion import Pinhole
 
     path = own.project(tmp_path)

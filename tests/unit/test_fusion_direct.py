@@ -303,7 +303,7 @@ def first_texture(problem):
 
 
 def base_level_shift(problem, result):
-    """Shift of each object that brings the mean of the selected, corrected predictions to that of their median."""
+    """Shift of each object that brings the mean of the selected, corrected predictions to the mean of the median prediction."""
     wanted, found, total = (np.zeros((OBJECTS, 5)) for _ in range(3))
     texture = first_texture(problem)
     for view, segments in enumerate(problem.segment_of_pixel):

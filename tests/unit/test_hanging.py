@@ -1,4 +1,4 @@
-"""What a test waits for in vain is told and killed."""
+"""A process for which a test waits in vain is reported and killed."""
 
 import subprocess
 import sys
@@ -23,7 +23,7 @@ print(hanging.end_all(os.getpid()))
 
 
 def test_a_process_and_its_child_are_told_and_killed():
-    """In a process of its own, because this one may have a browser."""
+    """In a separate process, because this one may have a browser."""
     said = subprocess.run([sys.executable, "-c", TEST], capture_output=True, text=True, timeout=60)
     assert said.returncode == 0, said.stderr
     assert "time.sleep(1000)" in said.stdout and said.stdout.endswith("it has started no process\n")

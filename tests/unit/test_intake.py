@@ -40,7 +40,7 @@ def refused(action, words):
 @pytest.mark.parametrize("name", BAD_NAMES)
 def test_names_that_become_no_files(tmp_path, name):
     assert fault_of_name(name)
-    if name not in ("a/b", "x" * (LONGEST + 1)):  # which is a folder and a file; and what a file name may add to that of a view
+    if name not in ("a/b", "x" * (LONGEST + 1)):  # a folder and a file; and longer than the name of a view, but not of a file
         with pytest.raises(InputError, match="neither read nor written"):
             inside(tmp_path, name)
 
@@ -111,7 +111,7 @@ def test_whatever_a_parser_throws_is_one_message(tmp_path, error):
 
 @pytest.mark.parametrize("text", ["[" * 900_000, "- " * 400_000 + "x", "{a: " * 100_000])
 def test_deep_settings_do_not_kill_the_process(tmp_path, text):
-    """libyaml composes by recursion in C: in a process of its own, because without the check a signal ends it."""
+    """libyaml composes by recursion in C. This runs in a separate process, because without the check a signal would end it."""
     (tmp_path / "x.yaml").write_text(text)
     code = "import sys, pathlib\nfrom workflow.settings.yaml_file import read_yaml\nread_yaml(pathlib.Path(sys.argv[1]))"
     run = subprocess.run([sys.executable, "-c", code, tmp_path / "x.yaml"], capture_output=True, text=True)

@@ -211,7 +211,7 @@ def test_computed_light_takes_its_share_of_the_error_away(lit):
     again = with_computed_light(gathering, views, light)
     before, after = error_of_light(gathering, views, light), error_of_light(again, views, light)
     left = 1 - inputs.COMPUTED_SHARE
-    # What is left beside that share is the size of a cell.
+    # In addition to that share, the size of a cell leaves an error.
     assert (before > 0.2).all() and (after < left * before + 0.06).all() and (after > 0.5 * left * before).all()
 
 

@@ -169,7 +169,7 @@ def test_election_by_hand():
 
 
 def test_small_things_win_against_what_they_stand_on():
-    """A face that is once in its own mask and twice in that of the table, whose masks are 100 times as large."""
+    """A face that is once in its own mask and twice in the mask of the table, whose masks are 100 times as large."""
     face = np.zeros(3, int)
     views = [
         view_votes(face, pack_keys(np.full((3, 3), 4), cluster), np.ones(3, bool), np.ones(3, bool), 2) for cluster in (0, 0, 1)

@@ -495,7 +495,7 @@ def test_more_views_see_no_less(load):
 
 
 def test_the_path_does_not_leave_the_room_of_the_sensor(load):
-    """A second room beside the first, closed: not reachable."""
+    """A second, closed room next to the first is not reachable."""
     other = box((4.2, 0, 0), (9, 3, 2.5)).replace('id="box"', 'id="box2"')
     _, mesh, _ = load(ROOM + other)
     found, *_ = plan(mesh, 8)

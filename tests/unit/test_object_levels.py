@@ -28,7 +28,7 @@ def _room(rng, n, light, base_error, kappa=1.0):
 def test_the_result_is_better_than_both_estimates(light, base_error):
     """Over rooms of forty objects: errors of the level after the division, against those of either estimate alone.
 
-    Where one is far better than the other, the result has to come close to it without being told which."""
+    Where one is far better than the other, the result has to come close to it without knowing which one that is."""
     errors = []
     for seed in range(8):
         rng = np.random.default_rng(seed)
@@ -147,8 +147,8 @@ def test_any_levels_give_finite_gains(base, shown, scatter, smooth, pixels, base
 
 
 def test_uneven_light_leaves_the_level_to_the_base_and_the_gloss_alone():
-    """One object in six whose light was computed half as bright as it is, unevenly: its level follows the base, not the light,
-    and the roughness of all objects stays that of a fit in the right light."""
+    """For one object in six, the light was computed half as bright as it is, and unevenly. The level of this object follows the
+    base, not the light. The roughness of the other objects stays as in a fit in the right light."""
     rng = np.random.default_rng(5)
     truth = np.tile(IDENTITY, (6, 1))
     truth[:, [0, 5, 10]] = 1.25  # the base is too dark by one factor everywhere

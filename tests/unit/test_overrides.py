@@ -1,4 +1,4 @@
-"""Corrections by hand (`overrides`): what is given stays exactly, and the fit of everything else goes on."""
+"""Corrections by hand (`overrides`): given values stay exactly as they are, and everything else is still fitted."""
 
 from dataclasses import replace
 from types import SimpleNamespace

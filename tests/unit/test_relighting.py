@@ -84,7 +84,7 @@ def test_settings_read_switches():
 
 
 def test_the_environment_of_a_scene_comes_back_as_it_was_found(tmp_path):
-    """The file beside a scene has other axes than relightings; where z is up, half a turn lies between them."""
+    """The file next to a scene has other axes than relightings; where z is up, half a turn lies between them."""
     found = np.random.default_rng(0).random((8, 16, 3), np.float32)
     write_exr(tmp_path / "environment.exr", split_rgb(environment_picture(found)))
     again = read_environment(tmp_path / "environment.exr", np.array([0.0, 0, 1]), 180.0)

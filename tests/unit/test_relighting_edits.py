@@ -212,7 +212,7 @@ def test_recombined_with_something_put_in(toy, tmp_path):
 
 
 def test_dimmed_is_darker_by_the_factor(toy):
-    """Also as a picture: the exposure is that of the photograph and not chosen anew."""
+    """Also as a picture: the exposure comes from the photograph and is not chosen anew."""
     from PIL import Image
 
     (found, dimmed, path), folder = lit(
@@ -703,7 +703,7 @@ def test_mistakes_in_a_plan_are_blamed_on_it(tmp_path, repository):
     for entries, words in (
         ("{name: a, lamsp: {bulb: off}}", "`relight.0.lamsp`: unknown key. Did you mean `lamps`"),
         ("{name: a b/c}", "`relight.0.name`: found 'a b/c'. Needed: letters, digits, _ and -"),
-        ("{name: a}, {name: a}", "`relight`: 2 relightings are called 'a'; every one needs a name of its own"),
+        ("{name: a}, {name: a}", "`relight`: 2 relightings are called 'a'; each needs its own name"),
         ("{name: a, camera: {views: [003]}}", '`relight.0.camera.views.0`: found 3. .* write it in quotes, such as "003"'),
         ("{name: a, insert: [{file: a.glb}]}", "`relight.0.insert.0.position`: missing. Add it; config/relight/kitchen.yaml"),
     ):

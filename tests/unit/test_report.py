@@ -305,7 +305,7 @@ def test_recovered_scene(toy):
 def test_response_is_read_back(toy):
     curve = read_response(FakeJob("publish", toy).read("affines"))
     np.testing.assert_allclose(curve(np.array([0.0, 0.5, 1.0])), [0, 0.5 ** (1 / 2.2), 1], atol=1e-3)
-    assert curve(np.array([2.0, 2.0, 2.0]))[0] > 1.2  # goes on as a straight line
+    assert curve(np.array([2.0, 2.0, 2.0]))[0] > 1.2  # continues as a straight line
 
 
 def test_response_of_different_grids_is_refused():

@@ -15,7 +15,7 @@ from workflow.report.verdict import Evidence, judge
 
 SIZE = 40
 RAMP = np.repeat(np.repeat(np.linspace(0, 1, SIZE)[None, :, None], SIZE, 0), 3, -1)
-"""Grows from left to right: every column has a value of its own."""
+"""Grows from left to right: every column has its own value."""
 
 
 def picture(title, image, kind="sensor", high=1.0, unit="sensor value", lossless=True):

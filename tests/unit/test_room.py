@@ -95,7 +95,7 @@ def test_texels_lie_on_the_surface(parts):
 
 
 def test_interpolation_finds_light_of_the_same_surface(parts):
-    """Every texel around any point of a chart is stored, and most have the light of a texel of the same wall beside them."""
+    """Every texel around any point of a chart is stored, and most have the light of a texel of the same wall next to them."""
     texels = lit_texels(parts, 64)
     row = np.full(64 * 64, -1)
     row[texels.stored] = texels.source

@@ -79,7 +79,7 @@ def test_adjacency_of_a_grid():
 
 
 def test_vertices_at_one_position_to_rounding_are_one():
-    """Every face has corners of its own, each a few spacings off: the neighbours are those of the joined mesh."""
+    """Every face has its own corners, each off by rounding: the neighbours are those of the joined mesh."""
     n = 12
     i, j = (axis.ravel() for axis in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
     a = i * (n + 1) + j

@@ -350,7 +350,7 @@ def test_limits_of_a_scene_hold_for_every_quality_and_raise_nothing(repository, 
 @pytest.mark.parametrize(
     ("draft", "message"),
     [
-        ("point: draft\n", r"config/quality/draft.yaml: `point`: found 'draft'; needed is the name of a file beside it"),
+        ("point: draft\n", r"config/quality/draft.yaml: `point`: found 'draft'; needed is the name of a file next to it"),
         ("point: nowhere\n", r"config/quality/draft.yaml: `point`: found 'nowhere'"),
         ("point: [p01]\n", r"config/quality/draft.yaml: `point`: found \['p01'\]"),
         ("capture: {veiws: 3}\n", r"config/quality/draft.yaml: `capture.veiws`: unknown key. Did you mean `views`?"),

@@ -47,11 +47,11 @@ def cluster(tmp_path, monkeypatch):
 
 
 def attempt(peak=None):
-    """Start a job whose process says nothing more and is gone; `peak` is the memory that it was last seen with."""
+    """Start a job whose process ended without a report; `peak` is the memory with which it was last seen."""
     state = JobState("a", "base", "mark")
     state.started()
     state._ended.set()
-    document = json.loads(state.path.read_text()) | {"start": 1}  # of a process that is gone
+    document = json.loads(state.path.read_text()) | {"start": 1}  # of a process that no longer exists
     state.path.write_text(json.dumps(document | ({"peak_mb": peak} if peak else {})))
     return json.loads(state.path.read_text())
 
@@ -153,7 +153,7 @@ def test_the_reason_is_that_of_the_run_and_of_the_batch(cluster):
 
 
 def test_attempts_of_an_earlier_run_do_not_count(cluster, monkeypatch):
-    """A command that is given again has told before why its jobs failed; a run that is not known counts as one."""
+    """A repeated command has already reported why its earlier jobs failed. A run without a number counts as another run."""
     for run, number in (("1", 1), ("1", 2), ("2", 1), ("2", 2), ("", 1)):
         monkeypatch.setenv(attempts.RUN, run)
         state = JobState("a", "base", "mark")
@@ -298,7 +298,7 @@ def test_why_jobs_were_refused(cluster, capfd):
     log = "    SLURM sbatch failed. The error message was 'sbatch: error: too\nlong'.\n    sbatch call:\n        sbatch -x\n"
     kept = ["sbatch: error: no such QOS", "no-sbatch-here: No such file or directory"]
     assert slurm.refusals(log) == [*kept, "sbatch: error: too long"]
-    assert slurm.submit("sbatch", "good", "--comment=a") == 0  # the next attempt was taken; that of b was not
+    assert slurm.submit("sbatch", "good", "--comment=a") == 0  # the next attempt of a was taken; b had none
     assert slurm.refusals("") == kept
     assert slurm.submit("sbatch", "good", "--comment=b") == 0
     assert slurm.refusals("") == kept[1:]

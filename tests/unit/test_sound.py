@@ -103,7 +103,7 @@ def test_damage_is_found_by_both(room, tmp_path, name, harm):
     HARMS[harm](room / name)
     found = faults(tmp_path)
     assert found and all(str(room / name) in line for line in found)
-    finish(tmp_path, "s", "report", ["capture"])  # something that makes `verify` miss a manifest that is gone
+    finish(tmp_path, "s", "report", ["capture"])  # another finished stage, not made from this one
     lines = list(damaged(tmp_path))
     if not (name == MANIFEST and harm in ("removed", "a folder")):
         assert any(str(room / name) in line for line in lines)
@@ -129,7 +129,7 @@ def test_a_stage_of_other_settings_is_not_taken(room, tmp_path):
     other = finish(tmp_path / "elsewhere", "s", "base", mark="1" * 16, value=0.02)
     shutil.rmtree(room)
     shutil.copytree(other, room)
-    assert faults(tmp_path) == (f"{room / MANIFEST}: it is that of other settings, inputs or code, and was put here",)
+    assert faults(tmp_path) == (f"{room / MANIFEST}: it belongs to other settings, inputs or code, and was put here",)
     assert faults(tmp_path, mark="1" * 16) == ()
 
 
@@ -324,7 +324,7 @@ def test_a_deliverable_of_other_settings_is_published_again(tmp_path):
     publish(second)
     shutil.rmtree(folder)
     shutil.copytree(earlier, folder)
-    assert found(second) == (f"{folder / MANIFEST}: it is that of other settings, inputs or code, and was put here",)
+    assert found(second) == (f"{folder / MANIFEST}: it belongs to other settings, inputs or code, and was put here",)
     assert found(first) == ()  # back to the settings of the first, it is what is wanted
     shutil.rmtree(folder)
     manifests.write(folder / MANIFEST, {"schema": manifests.SCENE_SCHEMA, "scene": "other", "fingerprint": first, "files": {}})

@@ -444,7 +444,7 @@ def test_which_scenes_are_shown(project):
     assert table.scenes_to_show() == ["a", "b"]
     Path("config/batch.tsv").write_text("name\tbase\nx\ta\ny\ta\n")
     assert table.scenes_to_show() == ["x", "y"]
-    JobState("b", "base", "mark").started()  # asked for by name, beside the batch
+    JobState("b", "base", "mark").started()  # asked for by name, in addition to the batch
     JobState("a--fast", "base", "mark").failed("no light")
     JobState("gone", "base", "mark").failed("no light")  # it was taken out of the table, and its file with it
     assert table.scenes_to_show() == ["x", "y", "a--fast", "b"]
@@ -506,7 +506,7 @@ def read(path):
 
 def test_a_job_tells_how_it_begins_and_ends(project, monkeypatch):
     JobState("a", "base", "mark").started()
-    assert not Path("events.jsonl").exists()  # nothing is told unless it is asked for
+    assert not Path("events.jsonl").exists()  # nothing is reported unless it is asked for
     monkeypatch.setenv(events.VARIABLE, str(project / "events.jsonl"))
     state = JobState("a", "base", "mark")
     state.started()
@@ -583,7 +583,7 @@ def test_where_events_go(tmp_path, monkeypatch):
     for named in ("", " ", "scenes/a", "scenes/e.jsonl", "results/a/events.jsonl"):
         with pytest.raises(InputError, match="name a file such as results/events.jsonl"):
             events.checked(named)
-    assert events.checked("/proc/events", tried=False) == "/proc/events"  # on a node, where a job goes on without
+    assert events.checked("/proc/events", tried=False) == "/proc/events"  # on a node, where a job continues without
     for named in ("file", "folder.jsonl", "file/e.jsonl", "/proc/events", "/proc/version.jsonl/x", "pipe.jsonl"):
         with pytest.raises(InputError, match=f"--config events={named}: "):
             events.checked(named)

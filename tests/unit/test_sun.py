@@ -66,7 +66,7 @@ def test_a_disc_contains_nothing_that_cameras_see_unsaturated():
     clear = np.ones(HEIGHT * WIDTH, bool)
     clear[sun_texels(sky)] = False
     clear = clear.reshape(HEIGHT, WIDTH).repeat(FINER, 0).repeat(FINER, 1).ravel()
-    for texel in (7 * WIDTH, 5 * WIDTH + 3):  # the saturated one, and one beside what is seen
+    for texel in (7 * WIDTH, 5 * WIDTH + 3):  # the saturated one, and one next to what is seen
         near = around(sky, texel)
         found = discs(sky, texel, near)
         assert len(found) >= FINER**2 * len(RADII) and all(len(disc.texels) for disc in found)
@@ -90,7 +90,7 @@ def test_the_sun_takes_its_texels_from_the_sky():
     np.testing.assert_allclose(prior.correlation[:-1, :-1], before.correlation, atol=1e-12)
     assert (prior.correlation[-1] == np.eye(lit.size)[-1]).all()
     np.testing.assert_allclose(prior.initial[-1], 2.0)
-    # Its irradiance is at most some ten times that of a sky of the mean radiance.
+    # Its irradiance is at most some ten times the irradiance of a sky of the mean radiance.
     assert prior.width[-1] * solid[own].sum() == pytest.approx(10 * np.pi)
     asked = with_columns(sky, 3)
     assert asked.size == sky.size + 3 and (asked.pixels[-3:] == 0).all() and asked.direction is None

@@ -182,7 +182,7 @@ def test_shipped_points_are_a_front_and_every_quality_can_be_loaded():
 
 
 def test_a_quality_by_name_says_what_it_takes_what_it_scored_and_which_scenes_set_it_themselves(monkeypatch):
-    monkeypatch.chdir(REPOSITORY)  # in a checkout the folder of the run is that of the shipped points
+    monkeypatch.chdir(REPOSITORY)  # in a checkout, the folder of the run holds the shipped points
     request = choose.read({"quality": "draft"}, set(), 2)
     point = trade_points.point_of("draft")
     assert point is trade_points.points()[trade_points.named()["draft"]]

@@ -144,7 +144,7 @@ def test_units_do_not_matter(unit, ratio):
 
 
 def test_sheets_on_a_ray(llvm):
-    """Two sides of one cloth half a millimetre apart count twice, as paths meet them; a ray beside them counts once."""
+    """Two sides of one cloth half a millimetre apart count twice, as paths meet them; a ray that misses them counts once."""
     from workflow.scene.see_through import _Behind
 
     levels = (0.0, 1.0, 1.0005, 1.6)

@@ -224,7 +224,7 @@ class Case:
 
     Attributes:
         make: makes it in the working folder, under a fingerprint.
-        counts: the part of a tree that must be that of an undisturbed run.
+        counts: the part of a tree that must equal the same part of an undisturbed run.
         judge: returns under which fingerprint it is finished; raises `Wrong`.
         before: makes what is there at first; returns the fingerprints that may be found besides the new one.
     """

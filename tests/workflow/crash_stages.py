@@ -103,8 +103,8 @@ class Stage:
         """End a run at a call, look, run again; return `unharmed`, `kept` or `lost`.
 
         Raises:
-            Wrong: what is there is taken for finished and is not as it should be, a second run ends with something else, or a
-                person is not told in one sentence what is wrong.
+            Wrong: what is there is taken for finished and is not as it should be, a second run ends with something else, or the
+                message does not say in one sentence what is wrong.
         """
         self.begin_again(empty)
         code, said, calls = self._run(Fault(kind, call))

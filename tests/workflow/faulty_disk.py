@@ -238,7 +238,7 @@ class Disk:
         """Return path -> content (None = a folder) of what may be on disk when power is cut before a call.
 
         Args:
-            call: number of the call; that of `steps` = after the last one.
+            call: number of the call; the number of `steps` = after the last one.
             choice: `all` or `none` of what was not flushed is kept, its `names` alone, its `data` alone, or chosen by chance.
         """
         changes = self._changes[: self._ends[call] if call < len(self._ends) else None]

@@ -35,7 +35,7 @@ def prepare(scenes: Sequence[str], template: str, quality: str = "draft", said: 
         scenes: their names; one that is there already is left as it is.
         template: a finished scene of the same folder, of the same kinds of source, prior and segmentation.
         quality: at which all of them are made.
-        said: told how far it is.
+        said: called with the progress, as text.
     """
     new = [scene for scene in scenes if not (SCENES / scene / MANIFEST).is_file()]
     for done, scene in enumerate(new):
@@ -57,7 +57,7 @@ def _stages(scene: str) -> list[str]:
 
 def _copy(scene: str, template: str, quality: str) -> None:
     document = json.loads(fp.resolved(scene, quality))
-    new: dict[str, str] = {}  # SHA-256 or fingerprint in the template -> that of the scene
+    new: dict[str, str] = {}  # SHA-256 or fingerprint in the template -> the same of the scene
     for name in OF_JOBS:
         _link(RESULTS / template / name, RESULTS / scene / name)
     for stage in _stages(template):

@@ -115,7 +115,7 @@ def test_what_publishing_left_is_made_by_publishing_again(workflow):
     record.write_bytes(whole)
     write(deliverable, json.loads(deliverable.read_text()) | {"fingerprint": "0" * 16})
     dry = workflow.run("scenes/tiny", "-n")
-    assert planned(dry) == {"publish"} and "scenes/tiny/manifest.json: it is that of other settings" in dry.stderr
+    assert planned(dry) == {"publish"} and "scenes/tiny/manifest.json: it belongs to other settings" in dry.stderr
 
 
 def test_the_last_line_is_the_reason_of_the_failed_job(workflow):

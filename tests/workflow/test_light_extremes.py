@@ -164,7 +164,7 @@ def test_hard_room(tmp_path, llvm):
 
 @pytest.mark.parametrize("pixels", ["all", 400])
 def test_views_that_are_held_out(tmp_path, llvm, pixels):
-    """No specular light is traced for them, and every stage goes on."""
+    """No specular light is traced for them, and every stage still runs."""
     build(tmp_path, truth=True, views=4, size=24, samples=16, held_out=(1,))
     _run(tmp_path, "hdr", upto="report" if pixels == "all" else "metrics", pixels=pixels)
     shading = StubJob("reader", tmp_path, {}).read("shading")
@@ -197,7 +197,7 @@ def test_white_room_with_a_black_and_a_saturated_view(tmp_path, llvm):
     found = _run(tmp_path, "ldr")
     radiance, _ = _kept(found)
     scale = found.affines.json("affines.json")["light_scale"]
-    # The walls are nearly as bright as the lamp, so what it adds of its own is known to a factor; pixels of 24 x 24 bound it.
+    # The walls are nearly as bright as the lamp, so what the lamp adds is known only to a factor; pixels of 24 x 24 bound it.
     ratio = np.sort(scale * radiance[:, 0]) / [LAMP, BULB]
     assert (ratio > 0.5).all() and (ratio < 2.5).all()
     for name in ("floor", "ceiling", "wall_a", "wall_c"):

@@ -108,7 +108,7 @@ def test_faces_between_the_chosen_pixels_are_seen(hdr):
 
 
 def test_without_lobes_no_path_is_traced_for_a_pixel(hdr, tmp_path):
-    """The light of a pixel is that of its cell, as if it came from everywhere; albedo is fitted alone, nearly as well."""
+    """The light of a pixel is the light of its cell, as if it came from everywhere. Albedo is fitted alone, nearly as well."""
     folder, room = hdr
     for stage in ("capture", "prior", "segmentation", "base", "emission", "second_look"):
         shutil.copytree(folder / stage, tmp_path / stage)

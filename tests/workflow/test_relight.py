@@ -78,7 +78,7 @@ def test_plans_stand_beside_the_relightings_of_a_scene(workflow):
     expected = files_of("half/{}_0000", "painted/{}_0000")
     assert pictures(folder / "plan") == expected
     assert "Nothing to be done" in workflow.run("scenes/tiny").stderr
-    # The example of a scene without relightings; what its plans left is there afterwards, and made again if a picture is gone.
+    # The example of a scene without relightings. What its plans left stays there, and is made again if a picture is missing.
     result = workflow.run("relight/tiny")
     assert result.returncode == 0, result.stderr[-3000:]
     assert (folder / "dimmed/frame_0000.png").is_file() and pictures(folder / "plan") == expected

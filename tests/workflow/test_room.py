@@ -169,7 +169,7 @@ def test_a_lamp_adds_what_paths_find(room, stored, finished, monkeypatch, llvm):
             traced[number_of_lamp].append(kd * (paths[0] - paths[1]))
     for change, expected in ((np.concatenate(f), np.concatenate(t)) for f, t in zip(found, traced, strict=True)):
         # More than the 0.03 of rooms with maps of their own size (lab/notebook/exports.md#room): a map of 128 x 128 is too coarse
-        # for the light beside the lamps (lab/notebook/decisions.md#light-maps).
+        # for the light next to the lamps (lab/notebook/decisions.md#light-maps).
         assert change.mean() == pytest.approx(expected.mean(), rel=0.04)
         assert np.median(np.abs(change - expected).mean(1)) < 0.15 * expected.mean()
 
@@ -222,7 +222,7 @@ def test_a_click_tells_the_object(room, stored):
 
 
 def test_what_is_selected_has_a_card_in_view_and_a_line_around_it(room, stored):
-    """The line is beside the object, whose own colours stay as they are."""
+    """The line lies next to the object, whose own colours stay as they are."""
     ball = next(one["id"] for one in stored.document["objects"] if one["name"] == "ball")
     room.evaluate("room.setPose([1.4, 0.6, 1.3], [0.8, 1.4, -0.338])")
     box = room.locator("#view").bounding_box()

@@ -45,7 +45,7 @@ def test_status_is_told_while_a_run_holds_the_folder(workflow):
         os.kill(job, signal.SIGSTOP)  # so that the stage lasts for as long as it is looked at
         assert any((folder / ".snakemake/locks").iterdir())
         assert scene_line(workflow).split()[1:3] == ["running", ROOM] and " of about " in scene_line(workflow)
-        assert len(sorted((folder / ".snakemake/log").iterdir())) == len(logs) + 1  # that of the run alone
+        assert len(sorted((folder / ".snakemake/log").iterdir())) == len(logs) + 1  # the log of the run alone
     finally:
         os.killpg(run.pid, signal.SIGKILL)
         run.wait()

@@ -10,7 +10,7 @@ from support import planned
 def test_a_budget_chooses_a_point_and_says_what_is_expected(workflow):
     result = workflow.run("-n", "scenes/tiny", "--config", "budget=600")
     assert result.returncode == 0, result.stderr[-4000:]
-    found = re.search(r"tiny, budget 600 s: point (p\d\d).*, about (\d+) s \(.*\), beside some \d+ s to render", result.stderr)
+    found = re.search(r"tiny, budget 600 s: point (p\d\d).*, about (\d+) s \(.*\), plus about \d+ s to render", result.stderr)
     assert found and float(found[2]) < 600
     assert "config/scenes/tiny.yaml sets capture.height, capture.views, capture.width" in result.stderr
     same = workflow.run("-n", "scenes/tiny", "--config", f"point={found[1]}")

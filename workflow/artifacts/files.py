@@ -76,7 +76,7 @@ def is_inside(folder: Path, name: str) -> bool:
 
 
 def write_atomically(path: Path, write: Callable[[Path], None], settled: bool = True, flushed: bool = True) -> None:
-    """Call `write(temporary)` beside `path`, flush that file to disk and rename it to `path`: no reader sees half a file, and
+    """Call `write(temporary)` for a file next to `path`, flush it to disk and rename it to `path`. No reader sees half a file;
     after a power cut `path` has its old content or the new one.
 
     Args:
@@ -173,8 +173,8 @@ def write_exr(
 ) -> dict[str, str]:
     """Write (H, W) arrays of float16, float32 or uint32 as one EXR, compressed without loss. Returns channel -> dtype.
 
-    `attributes` go into its header: text, numbers, tuples, and (4, 4) float32 matrices for row vectors. `settled` is that of
-    `write_atomically`.
+    `attributes` go into its header: text, numbers, tuples, and (4, 4) float32 matrices for row vectors. `settled` is as
+    in `write_atomically`.
 
     Raises:
         ValueError: shapes that differ, another dtype, or a value that is not finite.
@@ -223,7 +223,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
 def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str], settled: bool = True) -> dict[str, str]:
     """Write named columns; (n, k) arrays become fixed-size lists. Equal input gives equal bytes. Returns column -> type.
 
-    `settled` is that of `write_atomically`.
+    `settled` is as in `write_atomically`.
 
     Raises:
         ValueError: columns of different length, or a value that is not finite.

@@ -31,7 +31,7 @@ def found(results: Path, scene: str) -> list[Path]:
         try:
             with os.scandir(folder) as entries:
                 links += [entry.path for entry in entries if entry.is_symlink()]
-        except (FileNotFoundError, NotADirectoryError):  # what is in the way is told by who writes there
+        except (FileNotFoundError, NotADirectoryError):  # whoever writes there reports what is in the way
             continue
     return sorted({Path(link) for link in links})
 

@@ -1,6 +1,6 @@
 """One process at a time for each stage of a scene: two would remove one another's temporary files and mix their results.
 
-The lock is that of the kernel (`flock`), so it ends with its process, however that ends. Its file stays:
+The kernel holds the lock (`flock`), so the lock ends with its process, however that ends. Its file stays:
 `results/<scene>/locks/<stage>`.
 """
 
@@ -32,8 +32,8 @@ def place(results: Path, scene: str, stage: str) -> Path:
 
 @contextmanager
 def briefly(path: Path) -> Iterator[None]:
-    """Hold the lock of a file, and wait for it, for what takes no time: reading, changing and writing a file that many processes
-    add to. On a disk without locks work goes on."""
+    """Wait for the lock of a file and hold it, for what takes no time: reading, changing and writing a file that many processes
+    add to. On a disk without locks the work continues without one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with links.open_there(path, "a") as file:
         try:
@@ -46,7 +46,7 @@ def briefly(path: Path) -> Iterator[None]:
 
 @contextmanager
 def alone(results: Path, scene: str, stage: str) -> Iterator[None]:
-    """Hold the lock of a stage of a scene. On a disk without locks, as some of the network, a warning is logged and work goes on.
+    """Hold the lock of a stage of a scene. On a disk without locks, such as some network disks, log a warning and continue.
 
     Raises:
         InputError: another process holds it; the message says which, where and since when. Or a link is where the job writes.

@@ -1,7 +1,7 @@
 """Manifests: what a finished stage or a deliverable wrote, as sealed JSON of one possible spelling.
 
-The text is that of `json.dumps(document, indent=1, sort_keys=True)`, and its key `seal` is the SHA-256 of the text without that
-key. A file that differs from the spelling of its own content in any byte, or whose seal is not that of the rest, was changed.
+`json.dumps(document, indent=1, sort_keys=True)` makes the text; its key `seal` is the SHA-256 of the text without that key. A
+file was changed if any byte differs from what `json.dumps` makes of its content, or if its seal does not fit the rest.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _spelled(document: dict[str, Any]) -> str:
 
 
 def write(path: Path, document: dict[str, Any], settled: bool = True) -> None:
-    """Write a document with its seal, in one piece. `settled` is that of `write_atomically`."""
+    """Write a document with its seal, in one piece. `settled` is as in `write_atomically`."""
     text = text_of(document)
     write_atomically(path, lambda temporary: temporary.write_text(text), settled)
 

@@ -19,7 +19,7 @@ from workflow.artifacts.manifest import EARLIER_SCHEMA, MANIFEST, SCENE_SCHEMA, 
 from workflow.registry import SHARED
 
 MOST_LINES = 3
-"""Faults of one folder that are told; the number of the others is added."""
+"""Largest number of faults of one folder that are listed; the number of the others is added."""
 
 
 @lru_cache(None)
@@ -49,7 +49,7 @@ def _ended_badly(state: Path, fingerprint: str) -> bool:
     """Whether the last job of a stage did not end well, and was planned as what is wanted or run by hand.
 
     Args:
-        state: what the job left (`workflow/runtime/job_state.py`); it is gone when a job ends well.
+        state: file that the job left (`workflow/runtime/job_state.py`); a job that ends well deletes it.
         fingerprint: under which the stage is wanted.
     """
     try:
@@ -79,7 +79,7 @@ def _faults(folder: Path, noted: Path, schema: str, scene: str, stage: str, fing
         return
     if document.get("fingerprint") != fingerprint:
         put = known and own and known.fingerprint == fingerprint
-        yield f"{folder / MANIFEST}: it is that of other settings, inputs or code, and was put here" if put else ""
+        yield f"{folder / MANIFEST}: it belongs to other settings, inputs or code, and was put here" if put else ""
         return
     some = None  # whose contents are compared: all
     if known and different and (MANIFEST not in different or digest == known.manifest):
@@ -117,7 +117,7 @@ def _inputs(document: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
 
 
 def wrong_files(folder: Path, document: dict[str, Any], names: list[str] | None = None) -> Iterator[str]:
-    """Yield a line for each listed file that is gone or has another content.
+    """Yield a line for each listed file that is missing or has another content.
 
     Args:
         folder: with the files.
@@ -210,7 +210,7 @@ def copy_faults(folder: Path, results: Path, scene: str, stage: str) -> tuple[st
     try:
         document, digest = manifests.load(source)
     except manifests.Broken:
-        return ()  # told of the stage itself
+        return ()  # the stage itself reports this
     seen = stamps.look(folder, document["files"])
     problems = tuple(wrong_files(folder, document))
     if not problems:

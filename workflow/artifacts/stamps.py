@@ -98,7 +98,7 @@ def note(
         document: its manifest.
         seen: stamps that the files had before they were hashed; None = what they have now.
         manifest: SHA-256 of its manifest when `document` was read; empty = of what is there now.
-        copy: whether the folder is a copy, which has no manifest of its own.
+        copy: whether the folder is a copy, which does not have its own manifest.
         flushed: as in `write_atomically`. A plan notes thousands of folders, and the next one compares the contents of those
             whose notes a power cut has taken.
     """
@@ -121,7 +121,7 @@ def note(
 
 
 def stamp_stage(results: Path, scene: str, stage: str, seen: Mapping[str, Stamp] | None = None) -> None:
-    """Note the stamps of a stage that has just been written; `seen` is that of `note`."""
+    """Note the stamps of a stage that has just been written; `seen` is as in `note`."""
     folder = results / scene / stage
     note(place(results, scene, stage), folder, manifests.read(folder / MANIFEST), seen)
 

@@ -113,7 +113,7 @@ class StageWriter:
         """Note that a part of the stage is finished, so that a job that is killed need not repeat it; `finish` removes the note.
 
         Args:
-            part: name of the part, such as that of a view.
+            part: name of the part, such as the name of a view.
             names: the files that were written for it.
             facts: small document that `part_kept` gives back.
             by: digest of all that the part depends on, if that is less than the stage does; the note then stays in parts.json,
@@ -130,7 +130,7 @@ class StageWriter:
 
         Returns:
             What `part_done` noted; None if the part is to be made, because it was not finished, or under another fingerprint or
-            digest `by`, or a file is gone or has changed.
+            digest `by`, or a file is missing or has changed.
         """
         note = io.inside(self.directory, f"{UNFINISHED}/{part}.json")
         try:
@@ -154,7 +154,7 @@ class StageWriter:
         return done["facts"]
 
     def keep_state(self, name: str, arrays: Mapping[str, np.ndarray], facts: Any) -> None:
-        """Write down where a long computation is, so that a job that is killed goes on from there; `finish` removes it."""
+        """Write down how far a long computation has come. After a kill the next job continues from there; `finish` removes it."""
         document = json.dumps({"by": self.provenance["fingerprint"], "facts": facts})
 
         def write(path: Path) -> None:

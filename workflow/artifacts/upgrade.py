@@ -23,7 +23,7 @@ from workflow.registry import SHARED, STAGES
 
 
 def upgrade(results: Path = Path("results"), scenes: list[str] | None = None) -> Iterator[tuple[bool, str]]:
-    """Upgrade the stages of scenes, those that others are made from first; a killed upgrade goes on when it is called again.
+    """Upgrade the stages of scenes, upstream stages first. A killed upgrade continues when it is called again.
 
     Args:
         results: folder of the results.

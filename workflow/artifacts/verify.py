@@ -22,8 +22,8 @@ OF_SNAKEMAKE = ".snakemake_timestamp"
 
 def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator[str]:
     """Yield one line for each file that is not what was written, is missing or unlisted, for each symbolic link in its place, and
-    for each link of the chain that is broken: a folder that is gone although others were made from it, a stage whose manifest is
-    gone, and a stage that is not the one from which others were made.
+    for each broken link of the chain: a folder that is missing although others were made from it, a stage whose manifest is
+    missing, and a stage that is not the one from which others were made.
 
     Every content is hashed, whatever time stamps say.
     """
@@ -76,7 +76,7 @@ def _stage(folder: Path, stage: str, scene: str) -> Iterator[str]:
 
 
 def _is_broken(manifest: Path) -> bool:
-    """Whether a manifest was changed: that is told of its own stage, and not of each that was made from it."""
+    """Whether a manifest was changed. Its own stage reports that, and not each stage that was made from it."""
     try:
         manifests.read(manifest)
     except manifests.Broken:
@@ -153,8 +153,8 @@ def _gone(root: Path, scene: str) -> Iterator[str]:
 
 
 def _home(results: Path, scene: str, stage: str, document: dict[str, Any]) -> Path:
-    """Return the folder of the stage that a deliverable was made from. Variants of a study share equal results, so it is that of
-    another one which has the manifest that the deliverable names."""
+    """Return the folder of the stage that a deliverable was made from. Variants of a study share equal results: if this one has
+    no manifest, it is the folder of the variant whose manifest the deliverable names."""
     own, listed = results / scene / stage, document.get("manifests")
     digest = listed.get(stage) if isinstance(listed, dict) else None
     if "--" in scene and digest and not (own / MANIFEST).is_file():
@@ -188,7 +188,7 @@ def _published(root: Path, scene: str, damaged_results: bool) -> Iterator[str]:
         yield f"{folder}: a file where the folder of a scene belongs; move it away"
     else:
         finished = results / "publish" / MANIFEST
-        if not finished.is_file():  # that of a scene of which the page alone was asked for was never published
+        if not finished.is_file():  # if only the page of a scene was asked for, nothing was published
             finished = results / "report" / MANIFEST if (results / "logs/publish.log").is_file() else finished
         if finished.is_file():
             again = command(scene, "publish", _document(finished).get("quality"))
@@ -241,7 +241,7 @@ def _deliverable(manifest: Path, scene: str, results: Path, damaged_results: boo
 
 
 def _copied(results: Path, document: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield (name, stage) for each file of a deliverable whose content is not that of any stage with a file of this name."""
+    """Yield (name, stage) for each file of a deliverable that differs from the file of the same name in every stage."""
     listed: dict[str, dict[str, str]] = {}
     for stage in document.get("manifests", {}):
         made = _document(results / stage / MANIFEST).get("files")

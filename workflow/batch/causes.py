@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 FEW = 10
-"""So many scenes are told one by one; of more, the causes are told."""
+"""Largest number of scenes that are listed one by one; of more, the causes are listed."""
 ELLIPSIS = "…"
 _PATH = re.compile(r"[^\s'\"`(),;:=]*/[^\s'\"`(),;:]*")
 _FILE = re.compile(r"(?<![\w`.])[\w-]+(?:\.[\w-]+)*\.(?:exr|png|jpe?g|json|parquet|ply|obj|glb|yaml|tsv|npz|txt|xml|bin)\b", re.I)

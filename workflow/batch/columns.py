@@ -12,7 +12,7 @@ STATUSES = {
     "damaged": "published, and not what was written any more; the next run publishes it again",
     "refused": "its settings or data cannot be used; no job is started",
     "failed": "a job ended with an error",
-    "killed": "a job was started, did not end, and its process is gone (memory, time limit, node)",
+    "killed": "a job started but did not end, and its process no longer exists (memory, time limit, node)",
     "running": "a job of it runs",
     "not run": "jobs are missing and none of them has run as it would now",
 }

@@ -83,8 +83,8 @@ def faults_of_the_summary() -> tuple[str, ...]:
 
 
 def check(scene: str, quality: str) -> tuple[str, ...]:
-    """Check what Snakemake's plan of a scene looks at beside its settings and its source, and return what is wrong with what is
-    published, which publishing it again mends.
+    """Check what Snakemake's plan of a scene looks at besides its settings and its source. Return the faults of what is
+    published; publishing it again mends them.
 
     Raises:
         InputError: the folder of what is published is a file, or a link is where jobs write; or as `check_stage`.

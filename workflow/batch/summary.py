@@ -86,7 +86,7 @@ def refuse(quality: str) -> None:
 
 
 def closing(rows: Sequence[Row]) -> str:
-    """Return the last message of a run: how many scenes are done, what the others lack, and which jobs failed beside."""
+    """Return the last message of a run: how many scenes are done, what the others lack, and which other jobs failed."""
     done = [row for row in rows if row["status"] == "done"]
     judged = {word: sum(row["verdict"] == word for row in done) for word in VERDICTS}
     words = ", ".join(f"{count} {word}" for word, count in judged.items() if count)

@@ -1,1 +1,1 @@
-"""What is put side by side: two results, and anyone's maps beside a scene with truth."""
+"""Comparisons: of two results, and of anyone's maps with a scene with truth."""

@@ -1,6 +1,6 @@
 """`score/<scene>`: scores of anyone's maps against a scene with truth (docs/guide/comparing.md).
 
-The truth, the pixels that count, the protocols and the metrics are those of stage `metrics`, so that its scores can stand beside.
+Stage `metrics` uses the same truth, pixels, protocols and metrics, so its scores and these can be compared.
 """
 
 from __future__ import annotations

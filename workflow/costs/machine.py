@@ -1,4 +1,4 @@
-"""How fast this machine is, beside the one that the costs were fitted on: what its own finished jobs took."""
+"""How fast this machine is relative to the one that the costs were fitted on, from what its finished jobs took."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PRIOR_JOBS = 4
 
 @lru_cache(None)
 def machine_factor(root: Path = Path("results")) -> float:
-    """Return how many times as slow this machine is as that of the fits; 1 where no job has finished yet.
+    """Return how many times as long this machine takes as the machine of the fits; 1 where no job has finished yet.
 
     It is the geometric mean, over jobs, of CPU seconds taken over CPU seconds expected, with errors of single jobs cut at a
     factor of 3.

@@ -2,7 +2,7 @@
 
 cost = factor of the machine x sum over counts of (coefficient x count), for CPU seconds, memory and disk, for every stage and
 kind. Coefficients are non-negative and minimise the squared error of the logarithm, which counts large errors by their size
-(Huber) and many jobs of one room as the square root of their number. The range is that of the errors at rooms that the fit has
+(Huber) and many jobs of one room as the square root of their number. The range comes from the errors at rooms that the fit has
 not seen. Wall seconds follow from CPU seconds and from the share of them that threads divide.
 """
 
@@ -24,15 +24,15 @@ from workflow.costs.work import SceneSize, Work, work_of
 SHIPPED = Path(__file__).with_name("coefficients.json")
 MEASURES = ("cpu_seconds", "memory_mb", "disk_mb")
 OF_MEMORY = ("a_view",)
-"""Counts that memory alone follows: what is held at once, and not what is gone through."""
+"""Counts that only memory follows: what is held at once, and not the total that is processed."""
 SIZES = ("a_view", "pixels", "faces")
 """Counts that tell one size of a room from another."""
 TIMES = ("cpu_seconds", "seconds")
 """Columns that follow the speed of the machine."""
 FEWEST_ROOMS = 3
-"""Rooms from which on errors at unseen rooms are measured; with fewer, the range is that of `UNMEASURED`."""
+"""Number of rooms from which on errors at unseen rooms are measured; with fewer, the range is `UNMEASURED`."""
 LEAST_RATIO = 2.0
-"""Ratio of the largest to the smallest count, beside faces, below which all jobs are of one size."""
+"""Ratio of the largest to the smallest count, faces excepted, below which all jobs are of one size."""
 LEAST_SHARE = 1e-4
 """Share of the cost below which a count is left out."""
 UNMEASURED = (0.5, 2.0)

@@ -15,8 +15,8 @@ from workflow.registry import SHARED, STAGES
 
 MEASURES = ("cpu_seconds", "seconds", "memory_mb", "disk_mb")
 FIXED = ("scene", "stage", "kind", "threads", "machine", "fingerprint")
-"""Columns of the table beside measures and counts; `scene` is the room, without the study that took it, and `machine` how many
-times as long the machine takes as that of the first rows."""
+"""Columns of the table in addition to measures and counts. `scene` is the room, without the study that took it; `machine` is how
+many times as long the machine takes as the machine of the first rows."""
 
 
 def disk_mb(manifest: dict[str, Any]) -> float:
@@ -78,7 +78,7 @@ def _row(path: Path, manifest: dict[str, Any], known: dict[tuple[str, str], dict
 
 
 def _upstream(manifest: dict[str, Any], known: dict[tuple[str, str], dict[str, Any]]) -> dict[str, dict[str, Any]] | None:
-    """Return the manifests that a stage was made from, and its own; None if one is gone."""
+    """Return the manifests that a stage was made from, and its own; None if one is missing."""
     found = {manifest["stage"]: manifest}
     for name, entry in manifest["inputs"].items():
         if name.startswith(SHARED):  # what scores are compared with is no part of the work

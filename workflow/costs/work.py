@@ -24,7 +24,7 @@ PROBED_VIEWS = 32
 
 @dataclass(frozen=True)
 class SceneSize:
-    """What decides the cost of a scene beside its settings.
+    """What decides the cost of a scene, in addition to its settings.
 
     Attributes:
         views: photographs.

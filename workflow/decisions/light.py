@@ -29,7 +29,7 @@ def environment(setting: str, primary_escape: float, secondary_escape: float, re
         setting: `on`, `off` or `auto`.
         primary_escape: share of camera rays without a hit.
         secondary_escape: share of cosine-distributed rays from the surface that leave.
-        relative_brightness: mean radiance of escaping camera rays over that of the photographs; None = none escaped.
+        relative_brightness: mean radiance of escaping camera rays over the mean radiance of the photographs; None = none escaped.
 
     Returns:
         The decision.

@@ -26,7 +26,7 @@ def metallic(free: np.ndarray, prior_median: np.ndarray, setting: str = "auto") 
 
 
 def given_words(objects: int, given: np.ndarray | None) -> list[str]:
-    """Return in words what was given by hand of each object, e.g. `roughness, metallic`, from values (O, 2), NaN = fitted."""
+    """Name what was given by hand of each object, e.g. `roughness, metallic`, from values (O, 2), NaN = fitted."""
     known = np.zeros((objects, 2), bool) if given is None else ~np.isnan(given)
     return [", ".join(name for name, told in zip(("roughness", "metallic"), row, strict=True) if told) for row in known]
 

@@ -16,7 +16,7 @@ def segmentation(kind: str, objects: int, stability: float | None, perturbed: st
     Args:
         kind: of the segmentation; objects: number of objects that some photograph shows.
         stability: adjusted Rand index with the perturbed runs; None = nothing to perturb.
-        perturbed: what these runs change, in words; facts: numbers of the clustering, if there was one.
+        perturbed: what these runs change, as text; facts: numbers of the clustering, if there was one.
 
     Returns:
         The decision.

@@ -148,7 +148,7 @@ def _texels(charts: _Charts, size: int, index: Array, face: Array, weights: Arra
 
 
 def texels_of(parts: Sequence[TexturedPart], size: int) -> Texels:
-    """Find the surface under the texels of an atlas of `size` x `size`, which may be coarser than that of the materials."""
+    """Find the surface under the texels of an atlas of `size` x `size`, which may be coarser than the atlas of the materials."""
     charts = _charts(parts)
     face, barycentric = texel_surface(charts.uv, charts.faces, size)
     index = np.flatnonzero(face >= 0)

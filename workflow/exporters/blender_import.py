@@ -1,7 +1,7 @@
 """Sets up the recovered room in Blender (4.2 or newer): meshes with their lamps, the cameras of the photographs with the
 photographs as background, the light from outside, and the camera's response and exposure as the view's curves.
 
-    blender --python blender_import.py                       this file lies beside scene.glb
+    blender --python blender_import.py                       this file lies next to scene.glb
     blender --python blender_import.py -- /path/to/folder    or the folder that holds scene.glb and cameras.json
 
 or open it in Blender's text editor and run it. What is in the file is not touched, but for the cube, lamp and camera of the

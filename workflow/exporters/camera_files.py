@@ -1,4 +1,4 @@
-"""What a lighting artist expects beside the scene: cameras, photographs, the camera's response as a table, a script for Blender.
+"""What a lighting artist expects with the scene: cameras, photographs, the camera's response as a table, a script for Blender.
 
 Everything is returned as bytes by name; stage export writes them.
 """
@@ -21,7 +21,7 @@ from workflow.scene.normal_form import View
 Array = np.ndarray
 
 FILM_MM = 36.0
-"""Width of the sensor of cameras for programs that ask for millimetres: that of a 35 mm film."""
+"""Width of the sensor of cameras for programs that ask for millimetres: the width of 35 mm film."""
 LUT_SIZE = 1024
 SCRIPT = "blender_import.py"
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -47,7 +47,8 @@ def cameras_json(
 
     `transform_matrix` is the camera-to-world matrix with OpenGL axes, in metres and in the axes of the capture; `fl_x, fl_y, cx,
     cy` are pixels, the centre of the first pixel at 0.5. `blender.world_to_blender` turns that world to the one that Blender's
-    importer makes of scene.glb; `shift` are shares of the width of the sensor, and `pixel_aspect` is that of the render settings.
+    importer makes of scene.glb; `shift` are shares of the width of the sensor, and `pixel_aspect` belongs into Blender's render
+    settings.
     """
     frames = []
     for view, name, gain in zip(views, photos, gains, strict=True):

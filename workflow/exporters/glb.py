@@ -51,8 +51,8 @@ def glb_bytes(
         provenance: stored in `asset.extras`.
         views: photographs, which become cameras; glTF has no offset of the principal point, so that it is lost.
         exposure: with a number, `base_color` is the lit room as it appears on a screen at this factor on radiance. Materials are
-            then `KHR_materials_unlit`, and emitters are `KHR_lights_punctual`, too, for what a user puts beside them; a renderer
-            of scene.glb would count such lights twice.
+            then `KHR_materials_unlit`. Emitters are also `KHR_lights_punctual`, which light the things that a user adds; a
+            renderer of scene.glb would count such lights twice.
     """
     blob = _Blob()
     materials, meshes, nodes = [], [], []

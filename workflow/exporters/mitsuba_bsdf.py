@@ -1,4 +1,4 @@
-"""The reflectance of the method as a BSDF plug-in of Mitsuba, with textures. A copy lies beside exported scenes, with
+"""The reflectance of the method as a BSDF plug-in of Mitsuba, with textures. A copy lies next to exported scenes, with
 `iif_core.reflectance.brdf` and `iif_core.numerics.xp`; it therefore imports nothing else of the project."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Render the scene beside this file with the exact reflectance of the method:
+"""Render the scene next to this file with the exact reflectance of the method:
 
     python render.py [--view NAME] [--samples 256] [--size 640x480] [--output room.exr] [--variant llvm_ad_rgb]
 
@@ -73,7 +73,7 @@ def main() -> None:
     parser.add_argument("--view", default="", help="name of a photograph, without `view-`; the first one if it is left out")
     parser.add_argument("--samples", type=int, default=256, help="paths per pixel")
     parser.add_argument(
-        "--size", default="", help="WIDTHxHEIGHT in pixels, such as 960x960; that of the photographs if it is left out"
+        "--size", default="", help="WIDTHxHEIGHT in pixels, such as 960x960; the size of the photographs if left out"
     )
     parser.add_argument("--output", type=Path, default=Path("room.exr"), help=".exr (linear) or .png")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="of Mitsuba")

@@ -31,7 +31,7 @@ _NOTE = """
   The model of the workflow: k_d = (1 - m) a, k_s = 0.04 (1 - m) + m a, GGX, Schlick, no loss of the diffuse lobe.
   Mitsuba has no such BSDF. Half a `diffuse` of reflectance 2 k_d is its diffuse lobe; half a metal of `principled` is close
   to its specular lobe, with base colours that reflect as much light in all. textures/albedo.exr, roughness.exr and metallic.exr
-  are the recovered ones; `python render.py` beside this file renders them with the exact model.
+  are the recovered ones; `python render.py`, next to this file, renders them with the exact model.
 
   Curtains and blinds that let light through are a `mask`. Shadow rays do not pass it, so light behind it is noisy: take more
   samples.
@@ -39,7 +39,7 @@ _NOTE = """
   Faces are flat, as they were when materials and light were recovered: rounded ones reflect less at grazing angles. The PLY files
   have vertex normals, too; remove `face_normals` of a shape to have them.
 
-  All surface has one material, `surface`; to change a thing, give its shape a bsdf of its own in place of the reference.
+  All surface has one material, `surface`; to change a thing, give its shape its own bsdf in place of the reference.
   Relight: change or remove the emitters below, or add your own.
   Sizes: mitsuba -m scalar_rgb scene.xml -Dspp=256 -Dresx=640 -Dresy=480
   Other views: mitsuba -m scalar_rgb -s 1 scene.xml  (one sensor a photograph, in order)

@@ -24,7 +24,7 @@ def normal_picture(parts: Sequence[TexturedPart], recovered: Recovered, size: in
     """Draw glTF's normal texture, (S, S, 3) uint8: components along tangent, bitangent and normal of `vertex_tangents`, from
     [-1, 1] to [0, 1]. Parts that are as they were have (0, 0, 1).
 
-    The normal of a texel is that of the nearest point of the photographs' mesh, on the side of the simplified one.
+    A texel has the normal of the nearest point of the photographs' mesh, on the side of the simplified one.
     """
     picture = np.zeros((size * size, 3))
     picture[:, 2] = 1

@@ -27,9 +27,9 @@ def object_rows(
 ) -> dict[str, list]:
     """Return the columns of objects.csv, one entry per object; None where a number is not known.
 
-    Intervals hold the errors of the fitted numbers: of the albedo that of its level, a factor exp(+-1.96 sigma); of roughness and
-    metallic those of factor and offset of `T x + t`, taken as independent, sigma^2 = (x sigma_T)^2 + sigma_t^2. Numbers that were
-    not fitted have no error, and no interval is claimed for them.
+    Intervals hold the errors of the fitted numbers. For albedo it is the error of its level, a factor exp(+-1.96 sigma). For
+    roughness and metallic they are the errors of factor and offset of `T x + t`, taken as independent, sigma^2 = (x sigma_T)^2 +
+    sigma_t^2. Numbers that were not fitted have no error, and no interval is claimed for them.
 
     Args:
         names: one per object id.

@@ -14,7 +14,7 @@ from workflow.exporters.glb import rotation_to_y
 from workflow.scene.normal_form import View
 
 APERTURE = 0.36
-"""Width of the sensor of cameras in tenths of a metre, as USD counts it: that of a 35 mm film."""
+"""Width of the sensor of cameras in tenths of a metre, as USD counts it: the width of 35 mm film."""
 
 BASE_COLOR, SURFACE = "textures/base_color.png", "textures/surface.png"
 """Where the textures lie, relative to the file."""
@@ -26,11 +26,11 @@ def usd_bytes(
     """Make the scene in USD's binary form.
 
     Vertices stay in the world of the photographs (metres); the root prim turns `up` (3,) to +y. Names are made valid and kept
-    as display names. Emitters are mesh lights whose radiance is that of their material. A uniform environment becomes a dome
-    light; of a map (H, W, 3) only its place in the folder is noted.
+    as display names. Emitters are mesh lights with the radiance of their material. A uniform environment becomes a dome light;
+    of a map (H, W, 3) only its place in the folder is noted.
 
     Args:
-        parts: the meshes; their textures lie at `BASE_COLOR` and `SURFACE` beside the file.
+        parts: the meshes; their textures lie at `BASE_COLOR` and `SURFACE`, relative to the file.
         up: unit vector.
         environment: (3,) or (H, W, 3) radiance, as in `iif_core.light.environment`.
         views: photographs, which become cameras with their principal points.

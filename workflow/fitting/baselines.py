@@ -127,7 +127,7 @@ def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene, mixed: 
     """Take the mean radiance that photographs show of every cell as its albedo, without gloss (Eq. M.55).
 
     Cells that no photograph shows have the mean of their object. One gain for all cells makes albedo times diffuse light match
-    the radiance in least squares. The response is that of stage emission; saturated values are used as they are.
+    the radiance in least squares. Stage emission gives the response; saturated values are used as they are.
     """
     curve, gains = _start(job), read_gains(job)
     cells, objects = np.zeros((len(scene.cell_object), 4)), np.zeros((scene.n_objects, 4))
@@ -249,7 +249,7 @@ class CellPixels:
         return self._views(self.diffuse)
 
     def _views(self, diffuse: np.ndarray | None) -> Iterator[tuple[PixelRows, np.ndarray]]:
-        """Yield rows and cells with the diffuse light of blocks; if None, with that of the pixels and without lobes."""
+        """Yield rows and cells with the diffuse light of blocks; if None, with the diffuse light of the pixels, without lobes."""
         job, capture, gains = self.job, self.capture, read_gains(self.job)
         views = capture.used
         for done, view in enumerate(views):

@@ -14,8 +14,8 @@ from workflow.intake import limits
 from workflow.intake.documents import check_file, reading
 
 FORMATS = ("PNG", "JPEG")
-"""Formats of Pillow that photographs may have, whatever their name: other readers, such as that of PostScript, stay shut. MPO,
-which telephones write as .jpg, is opened as JPEG."""
+"""Formats of Pillow that photographs may have, whatever their name; Pillow's other readers, such as its PostScript reader, are
+not used. MPO, which telephones write as .jpg, is opened as JPEG."""
 TEXTURES = (*FORMATS, "BMP", "TGA", "PPM")
 """The same for textures of Mitsuba scenes and of meshes."""
 PNG_MAGIC = b"\x89PNG"

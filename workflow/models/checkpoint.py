@@ -39,10 +39,10 @@ class Origin:
 
     Attributes:
         repository: where its authors publish it.
-        licence: in words.
+        licence: as text.
         section: of the settings that names the checkpoint.
         index: file that describes the content of its folder.
-        layout: of the folder, in words.
+        layout: description of the folder.
         page: of the documentation.
     """
 

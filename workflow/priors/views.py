@@ -146,7 +146,7 @@ class CaptureViews:
         parts = []
         for number, view in enumerate(self.views):
             own = self.of(view)
-            # The response is that of single sensor values, not of means: of a block, the middle pixel speaks.
+            # The response applies to single sensor values, not to means, so the middle pixel stands for its block.
             value, valid = (_middles(array, self.factor) for array in self.capture.photo(view))
             use = own.used & valid & ~borders(own.group)
             group = own.group[use]

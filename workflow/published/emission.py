@@ -81,7 +81,7 @@ def run(job: Job) -> None:
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     if capture.is_hdr:
         raise InputError(
-            f"emission.solver: {job.settings.emission.solver}: the published loss is that of 8-bit photographs, and these are"
+            f"emission.solver: {job.settings.emission.solver}: the published loss is for 8-bit photographs, and these are"
             " linear; set `capture: {dynamic_range: ldr}` or another solver"
         )
     if capture.facts.get("exposure_estimated"):

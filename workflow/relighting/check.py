@@ -1,4 +1,4 @@
-"""What can be wrong with relightings, told before any job where the stages that know it are finished."""
+"""Checks of relightings. They run before any job, as far as the stages that they need are finished."""
 
 from __future__ import annotations
 

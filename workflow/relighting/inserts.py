@@ -37,7 +37,7 @@ class InsertedMesh:
         radiance: (textures, 3) float64 that the material of each emits: factor times strength of glTF.
         double_sided: (textures,) bool, the material is seen, and emits, on both sides.
         glowing: names of materials whose emission has a texture.
-        left_out: what else of the file is not shown, in words.
+        left_out: what else of the file is not shown, as text.
     """
 
     corners: Array
@@ -83,7 +83,7 @@ def load_insert(path: Path) -> InsertedMesh:
 
 
 def light_of(mesh: InsertedMesh, insert: dict[str, Any]) -> Array:
-    """Return the radiance (k, 3) float64 of the faces of a mesh: that of a dumped `insert`, or else that of its materials.
+    """Return the radiance (k, 3) float64 of the faces of a mesh: from a dumped `insert`, or else from its materials.
 
     Raises:
         InputError: the emission of a material of the file, which would shine, has a texture, or is no radiance.

@@ -86,7 +86,7 @@ class Inventory:
 
 
 class Problems:
-    """Collects what is wrong, so that all of it is told at once."""
+    """Collects what is wrong, to report all of it at once."""
 
     def __init__(self) -> None:
         self.messages: list[str] = []

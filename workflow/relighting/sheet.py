@@ -1,4 +1,4 @@
-"""The contact sheet: what every relighting changes, with the room as it was found beside it."""
+"""The contact sheet: what every relighting changes, next to the room as it was found."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def png(picture: Array) -> bytes:
 
 def contact_sheet(rows: list[Row], title: str = "") -> Array:
     """Draw the relightings in the order of reading, (H, W, 3) uint8: each with its title, then pairs of pictures with captions.
-    Those that fit beside one another stand on one line, and the title of all of them stands above."""
+    Relightings that fit next to one another share a line; the title of the sheet is at the top."""
     from PIL import Image, ImageDraw, ImageFont
 
     head, ruler = ImageFont.load_default(22), ImageDraw.Draw(Image.new("RGB", (1, 1)))
@@ -118,7 +118,7 @@ def _wrapped(text: str, font: Any, width: int, ruler: Any) -> list[str]:
 
 
 def described(entry: dict[str, Any], default: str = "as found") -> str:
-    """Return what a dumped relighting changes, in words, for captions."""
+    """Describe what a dumped relighting changes, for captions."""
     parts = []
     if entry["emitters"] != 1:
         parts.append(f"{'all' if not entry['lamps'] else 'other'} lamps {_factor(entry['emitters'])}")

@@ -13,7 +13,7 @@ from iif_core.errors import InputError
 
 ENCODERS = {"av1": "libsvtav1", "h264": "libx264"}
 OPTIONS = {"av1": {"preset": "8", "crf": "24"}, "h264": {"preset": "medium", "crf": "20"}}
-"""Settings of the encoders: good quality, at a speed that is small beside rendering."""
+"""Settings of the encoders: good quality, in little time compared with rendering."""
 KEYFRAMES = 2
 """Seconds between frames that a player can jump to."""
 
@@ -22,7 +22,7 @@ def require_codec(codec: str, name: str) -> None:
     """Check that a codec can be written.
 
     Raises:
-        InputError: the encoder is not there; `name` is that of the relighting.
+        InputError: the encoder is not there; the message says `name`, the name of the relighting.
     """
     import av
 

@@ -39,8 +39,8 @@ EQUAL_SHARE = 0.5
 class World:
     """A room in which every lamp is a column; m faces, L lamps.
 
-    Lamps are traced in white, with the mean of their channels: light of one channel never becomes that of another, so any colour
-    is a weight. All surface reflects, that of lamps too, so that light is linear in what lamps emit.
+    Lamps are traced in white, with the mean of their channels: light of one channel never becomes light of another, so any colour
+    is a weight. All surface reflects, including the surface of lamps, so that light is linear in what lamps emit.
 
     Attributes:
         geometry, material: on the device.

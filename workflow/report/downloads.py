@@ -1,4 +1,4 @@
-"""What the files of a deliverable are, in words, and how one goes on from it: for the last section of the report."""
+"""Text for the last section of the report: what the files of a deliverable are, and what to do next with them."""
 
 from __future__ import annotations
 

@@ -11,17 +11,17 @@
     return made;
   };
 
-  // Theme: that of the system until the button is pressed; kept where the browser lets a file keep something.
+  // Theme: the system's until the button is pressed; the choice is kept where the browser lets a file keep something.
   const dark = () => (root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches);
   const theme = byId("theme");
-  const told = () => { theme.textContent = dark() ? "Light" : "Dark"; theme.setAttribute("aria-label", `Use the ${dark() ? "light" : "dark"} theme`); };
+  const showTheme = () => { theme.textContent = dark() ? "Light" : "Dark"; theme.setAttribute("aria-label", `Use the ${dark() ? "light" : "dark"} theme`); };
   try { if (localStorage.iifTheme) root.dataset.theme = localStorage.iifTheme; } catch { /* no storage */ }
   theme.addEventListener("click", () => {
     root.dataset.theme = dark() ? "light" : "dark";
     try { localStorage.iifTheme = root.dataset.theme; } catch { /* no storage */ }
-    told();
+    showTheme();
   });
-  told();
+  showTheme();
 
   // Photograph over re-rendering.
   for (const slider of all(".compare input")) {
@@ -42,9 +42,9 @@
     tip.textContent = entry.textContent;
     tip.showPopover();
     shown = link;
-    beside();
+    placeTip();
   };
-  const beside = () => {
+  const placeTip = () => {
     if (!shown) return;
     const at = shown.getBoundingClientRect(), box = tip.getBoundingClientRect();
     tip.style.left = `${Math.max(8, Math.min(at.left, innerWidth - box.width - 8))}px`;
@@ -57,7 +57,7 @@
     link.addEventListener("blur", hide);
     link.addEventListener("click", (event) => { event.preventDefault(); show(link); });
   }
-  addEventListener("scroll", beside, { passive: true, capture: true });  // focus may scroll the number into view
+  addEventListener("scroll", placeTip, { passive: true, capture: true });  // focus may scroll the number into view
   addEventListener("keydown", (event) => { if (event.key === "Escape") hide(); });
 
   const text = (cell) => cell.textContent.trim().toLowerCase();
@@ -127,7 +127,7 @@
   };
   const digits = (value) => Number(value.toPrecision(3)).toString();
   const decoded = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
-  // What the colour of a pixel stands for, in words: the inverse of workflow/report/pictures.py.
+  // What the colour of a pixel stands for, as text: the inverse of workflow/report/pictures.py.
   const valueAt = (image, u, v) => {
     const data = pixelsOf(image);
     const x = Math.min(data.width - 1, Math.floor(u * data.width)), y = Math.min(data.height - 1, Math.floor(v * data.height));

@@ -125,7 +125,7 @@ def difference(a: Array, b: Array, mask: Array, high: float = 0.25) -> Array:
 
 
 def edges(ids: Array) -> Array:
-    """Find pixels whose id differs from that of the pixel to the right or below; (H, W) bool."""
+    """Find pixels whose id differs from the id of the pixel to the right or below; (H, W) bool."""
     out = np.zeros(ids.shape, bool)
     out[:-1] |= ids[:-1] != ids[1:]
     out[:, :-1] |= ids[:, :-1] != ids[:, 1:]

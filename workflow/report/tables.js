@@ -1,7 +1,7 @@
 "use strict";
-// Tables that sort by a click on their heads: numbers before words, nothing last, `data-sort` of a cell before its text. `told` is
-// called with (column, upwards) after a click; the function that is returned sorts without one.
-const sortable = (table, body, told = () => {}) => {
+// Tables that sort by a click on their heads: numbers before words, nothing last, `data-sort` of a cell before its text. `sorted`
+// is called with (column, upwards) after a click; the function that is returned sorts without one.
+const sortable = (table, body, sorted = () => {}) => {
   const heads = [...table.querySelectorAll("thead th")];
   const key = (row, column) => {
     const cell = row.cells[column];
@@ -28,7 +28,7 @@ const sortable = (table, body, told = () => {}) => {
     button.addEventListener("click", () => {
       const up = head.getAttribute("aria-sort") !== "ascending";
       sort(column, up);
-      told(column, up);
+      sorted(column, up);
     });
   });
   return sort;

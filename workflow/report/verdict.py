@@ -79,7 +79,7 @@ class Evidence:
     """What is known about a result; None where nothing was measured. Shares are of 1, factors of 1, scores in dB.
 
     Attributes:
-        escape: share of the rays from surface that leave the mesh; escape_camera: that of the rays from cameras.
+        escape: share of the rays from surface that leave the mesh; escape_camera: the same of the rays from cameras.
         depth: median disagreement of mesh and measured depth.
         edges: correlation of edges of photographs and mesh; edges_warn: whether the source found it too weak.
         agreement: median correlation of a photograph with what the others show of the same surface.
@@ -181,7 +181,7 @@ class Verdict:
         return WORDS[self.level]
 
     def document(self) -> dict[str, Any]:
-        """Return the verdict as `verdict.json` has it: in words, with all findings."""
+        """Return the verdict as `verdict.json` has it: as text, with all findings."""
         lights = {
             light.name: {"verdict": light.word, "findings": [
                 {"verdict": WORDS[one.level], "text": one.text, "remedy": one.remedy} for one in light.findings
@@ -415,7 +415,7 @@ ROUGHNESS_HELD = (76, 85)
 
 
 def _off(psnr: float | None) -> str:
-    """Return in words the error that a PSNR against a range of 1 stands for."""
+    """Describe the error that a PSNR against a range of 1 stands for."""
     return f", an error of about {10 ** (-psnr / 20):.2f}" if psnr is not None and np.isfinite(psnr) else ""
 
 
@@ -435,9 +435,7 @@ def _scale(e: Evidence) -> Light:
             GREEN, f"The level is fixed by {FIXED[e.level]}" + (f" (within {percent(e.level_error)})" if e.level_error else "")
         )
     elif e.level in CONVENTION:
-        error = (
-            "" if e.level_error is None else f"; its error of {percent(e.level_error)} does not contain that of the convention"
-        )
+        error = "" if e.level_error is None else f"; its error of {percent(e.level_error)} leaves out the error of the convention"
         fixed = Finding(AMBER, f"The level is a convention: {CONVENTION[e.level]}{error}", patch)
     else:
         fixed = _finding(

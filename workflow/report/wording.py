@@ -14,7 +14,7 @@ FITTED = {
     "gain": "colour by factors",
     "metal": "taken as metal",
 }
-"""Parts of `model` of objects.parquet (`iif_core.fitting.selection`) in words; others are words already."""
+"""Text for parts of `model` of objects.parquet (`iif_core.fitting.selection`); other parts are text already."""
 
 
 def percent(share: float, digits: int = 0) -> str:
@@ -30,7 +30,7 @@ def significant(value: float, digits: int = 3) -> str:
 
 
 def fit_words(model: str) -> str:
-    """Return in words what was fitted of an object, from `model` of objects.parquet, such as `full, roughness, metal`."""
+    """Describe what was fitted of an object, from `model` of objects.parquet, such as `full, roughness, metal`."""
 
     def words(part: str) -> str:
         found = re.fullmatch(r"(population|identity) \((\d+) pixels\)", part)
@@ -43,7 +43,7 @@ def fit_words(model: str) -> str:
 
 
 def reason_words(component: str, reason: str) -> str:
-    """Return the reason of a decision in words: what was fitted of how many objects is told in the terms of `fit_words`."""
+    """Return the reason of a decision as text. It says in the terms of `fit_words` what was fitted of how many objects."""
     if component != "affine_size":
         return reason
     words = FITTED | {"population": "nothing, as other objects", "identity": "nothing, as predicted"}

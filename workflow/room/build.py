@@ -117,8 +117,9 @@ def geometry_blobs(parts: Sequence[TexturedPart], frame: Frame) -> tuple[dict[st
 def picture_blobs(atlas: Atlas, largest: int) -> dict[str, Blob]:
     """Return the base colour (sRGB), and as red, green and blue of one picture the uncertainty, roughness and metallic.
 
-    Red is the uncertainty over UNCERTAINTY_MOST, that of the nearest surface where no photograph shows it; alpha is 0 there and 1
-    elsewhere. Interpolation between both then changes what is unknown into what is known, and never into a large uncertainty.
+    Red is the uncertainty over UNCERTAINTY_MOST. Surface that no photograph shows has the uncertainty of the nearest surface that
+    one shows, and alpha 0; alpha is 1 elsewhere. Interpolation between both then changes what is unknown into what is known, and
+    never into a large uncertainty.
     """
     from scipy.ndimage import distance_transform_edt
 

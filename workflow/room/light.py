@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 Array = np.ndarray
 
 BESIDE = 2.0
-"""A texel beside a chart has the light of the nearest texel of its part up to this distance, in texels, where a difference of
-the normals of `NORMAL_REACH` counts as one."""
+"""A texel next to a chart takes the light of the nearest texel of its part up to this distance, in texels. A difference of the
+normals of `NORMAL_REACH` counts as one texel."""
 EQUAL_SHARE = 0.5
 """Share of the draws that all lamps have alike; the rest is by power."""
 CHUNK = 1 << 16
@@ -47,8 +47,8 @@ class Lamp:
     Attributes:
         name: for people.
         emitters: ids of its emitters; empty = the environment.
-        color: (3,) linear, largest 1: the light is that of the map times this. White where the map has colours of its own,
-            because several emitters or the texels of the environment differ.
+        color: (3,) linear, largest 1: factor on the light of the map. White where the map has its own colours, because several
+            emitters or the texels of the environment differ.
         radiance: (3,) mean radiance of its surface, or of the environment over all directions.
         power: of all its light, in m^2 sr of radiance; of the environment, as much as enters through surface that is missing is
             not known, so that it is 0.
@@ -125,9 +125,9 @@ def _color(radiance: Array) -> Array:
 class LitTexels:
     """The surface under the texels of a light map: n at which light is traced, and t that are stored.
 
-    Interpolation between texels reads those around each chart as well. Light is traced at the centre of a
-    texel, where that has no surface at the nearest point that has, and at the point nearest to a texel beside a chart where no
-    texel with surface is near and alike, as in charts narrower than a texel; else a texel beside a chart has the light of that.
+    Light is traced at the centre of a texel or, if there is no surface at its centre, at the nearest point of the texel that has
+    surface. Interpolation also reads the texels next to each chart. Such a texel takes the light of a texel with surface that is
+    near and alike. If there is none, as with charts narrower than a texel, its light is traced at the nearest point of the chart.
 
     Attributes:
         size: S, of the map.
@@ -365,8 +365,8 @@ def lit_scene(parts: Sequence[TexturedPart], surface: BaseScene, lamps: Lamps) -
 
 
 def _draws(power: Array, lamp: Array, lamps: int) -> Array:
-    """(m,) how often each face is drawn: `EQUAL_SHARE` of the draws alike for all lamps, so that the light of weak ones is not
-    noisier than that of strong ones, and the rest by power."""
+    """(m,) how often each face is drawn. `EQUAL_SHARE` of the draws is the same for all lamps, so that the light of weak lamps is
+    not noisier than the light of strong ones; the rest goes by power."""
     own = lamp >= 0
     total = np.bincount(lamp[own], power[own], lamps)
     lit = int((total > 0).sum())

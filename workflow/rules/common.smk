@@ -261,7 +261,7 @@ def job(stage):
 
 
 def on_nodes():
-    """Whether jobs are submitted to a cluster; each has a Snakemake of its own there."""
+    """Whether jobs are submitted to a cluster; each has its own Snakemake there."""
     plugin = workflow.executor_plugin
     return plugin is not None and plugin.common_settings.non_local_exec
 
@@ -298,7 +298,7 @@ def no_stage(wildcards):
 
 
 def publish_inputs(*names):
-    """What is published. A deliverable of which a file is gone, or that is another one than is wanted, is published again."""
+    """What is published. A deliverable is published again if one of its files is missing, or if it is not the one that is wanted."""
     inputs_of = reads("publish", *names)
 
     def inputs(wildcards):
@@ -323,7 +323,7 @@ def publish_inputs(*names):
 
 
 def relit_inputs(wildcards):
-    """The relightings of a scene, or one plan of them; those of which a picture is gone are copied again."""
+    """The relightings of a scene, or one plan of them; those with a missing picture are copied again."""
     scene, plan = wildcards.scene, wildcards.get("plan", "")
     folder = f"relight/{scene}/{plan}" if plan else f"relight/{scene}"
     asked = [
@@ -362,7 +362,7 @@ def again_if_unsound(target, words, faults):
 
 
 def plan_inputs(wildcards):
-    """The plan of a scene; if it is gone from plan/<scene>/, it is written there again."""
+    """The plan of a scene; if it is missing from plan/<scene>/, it is written there again."""
     folder = Path("plan") / wildcards.scene
     folder_or_stop(str(folder))
     if folder.is_dir() and not (folder / "plan.yaml").is_file():
@@ -371,7 +371,7 @@ def plan_inputs(wildcards):
 
 
 def bench_inputs(wildcards):
-    """Scores of the three points that are run in this room; a bench of which a file is gone is written again."""
+    """Scores of the three points that are run in this room; a bench with a missing file is written again."""
     folder = f"bench/{wildcards.scene}"
     folder_or_stop(folder)
     names = ("bench.json", "bench.md")
@@ -465,7 +465,7 @@ def unknown(wildcards):
 
 
 def status_alone(wildcards):
-    """Input of `status`, which is answered before any rule is looked at, unless something else is asked for beside it."""
+    """Input of `status`. Alone, `status` is answered before any rule is looked at; with other targets it ends here."""
     stop(
         "status: ask for it alone, `snakemake status`; of some scenes, `python -m workflow status <scene> ...`"
     )
@@ -493,14 +493,14 @@ def batch_plan():
         if (
             workflow.execution_settings is not None
         ):  # None where nothing is run, as for --summary
-            # A batch is independent scenes: as --keep-going, for this target without being told.
+            # The scenes of a batch are independent, so this target always runs as with --keep-going.
             workflow.execution_settings.keep_going = True
     return plan
 
 
 def batch_targets(wildcards):
-    """The summary, and every scene by itself, so that an old summary never stands for a scene that is gone. Parts
-    (`--batch batch=1/10`) divide what the summary reads, so there it stands alone."""
+    """The summary, and every scene by itself, so that an old summary never stands for a scene that was deleted.
+    Parts (`--batch batch=1/10`) divide what the summary reads, so it is alone there."""
     plan = batch_plan()
     scenes = (
         [] if workflow.dag_settings.batch else [f"scenes/{name}" for name in plan.ready]

@@ -134,7 +134,7 @@ rule compare:
         mark=compared,
         quality=QUALITY,
     message:
-        "{wildcards.first} beside {wildcards.second}: compare/{wildcards.first},{wildcards.second}/compare.html"
+        "{wildcards.first} next to {wildcards.second}: compare/{wildcards.first},{wildcards.second}/compare.html"
     shell:
         "python3 -m workflow compare {wildcards.first} {wildcards.second} --quality {params.quality} --output {output.page:q}"
         " --log {log:q}"

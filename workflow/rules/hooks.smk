@@ -32,7 +32,7 @@ def tell_costs():
 
 
 def tell_costs_of_dry_run():
-    """The same at the end of a dry run, which has no hook of its own; Snakemake has gone back to the folder of the caller by then."""
+    """The same at the end of a dry run, for which Snakemake has no hook. By then it has returned to the folder of the caller."""
     if workflow.is_main_process and workflow.dryrun and workflow.dag is not None:
         os.chdir(FOLDER)
         tell_costs()
@@ -119,7 +119,7 @@ def tell_reasons(logs):
     if not workflow.is_main_process:
         return  # a job on a node of a cluster
     refused = refused_by_slurm(logs)
-    if refused:  # what is told last is registered first
+    if refused:  # registered first, so printed last
         atexit.register(print, "\n" + "\n".join(refused), file=sys.stderr)
     if batch_asked:
         # Jobs failed, so the summary was not made: it tells of what there is. It is not `complete`, so the next run makes it.

@@ -1,6 +1,6 @@
-"""Attempts of a job: how those before it ended, in words. The facts stand in the file of its state (`job_state.py`).
+"""Attempts of a job: text that says how the earlier ones ended. The state file of the job holds the facts (`job_state.py`).
 
-A job that is killed says nothing itself, so Slurm is asked, or what was seen of its memory is told.
+A job that is killed says nothing itself. Slurm is asked instead, or the memory with which the job was last seen is reported.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from workflow.runtime import alive, slurm
 RUN = "IIF_RUN"
 """Variable that names the run of Snakemake that a job belongs to; jobs on other machines inherit it."""
 REMEMBERED = 3
-"""Earlier attempts that are told of."""
+"""Largest number of earlier attempts that are reported."""
 TIMES = (0.0, 1e11)
 """Seconds since 1970 that can be a time of a job; the last is in the year 5138."""
 GUESS = "out of memory, or over its time limit?"
@@ -28,8 +28,8 @@ def facts_of(before: dict[str, Any], fingerprint: str, run: str = "") -> dict[st
     Args:
         before: state that the attempt before has left; empty if that ended well.
         fingerprint: of this attempt; attempts at something else do not count.
-        run: of Snakemake; attempts of an earlier run do not count. That one has told of those that failed; one that was killed
-            is told of, because its run may have been killed with it. Empty where none is known.
+        run: of Snakemake; attempts of an earlier run do not count. That run has reported its attempts that failed. An attempt
+            that was killed is reported now, because its run may have been killed with it. Empty where no run is known.
     """
     own = slurm.own()
     facts: dict[str, Any] = {"attempt": 1}
@@ -49,7 +49,7 @@ def facts_of(before: dict[str, Any], fingerprint: str, run: str = "") -> dict[st
 
 
 def told(facts: dict[str, Any]) -> str:
-    """Return in words what `facts_of` found of earlier attempts, and what this one asks for; empty for a first attempt."""
+    """Describe the earlier attempts that `facts_of` found, and what this one asks for; empty for a first attempt."""
     earlier = facts.get("earlier")
     if not earlier:
         return ""
@@ -122,7 +122,7 @@ _FORMS: dict[str, Callable[[Any], Any]] = {
 
 
 def ending(document: dict[str, Any], now: slurm.Own | None = None) -> str:
-    """Return in words how an attempt ended that did not end well.
+    """Describe how an attempt ended that did not end well.
 
     Args:
         document: its state file.
@@ -153,7 +153,7 @@ def ending(document: dict[str, Any], now: slurm.Own | None = None) -> str:
 
 
 def killed(document: dict[str, Any]) -> str:
-    """Return in words why a job says `started` and its process is gone, as far as that can be known."""
+    """Explain, as far as it can be known, why the state of a job is `started` although its process no longer exists."""
     number, own, earlier = document.get("attempt", 1), document.get("slurm"), document.get("earlier", [])
     if not own and not earlier:
         peak = document.get("peak_mb")
@@ -176,7 +176,7 @@ def _place(document: dict[str, Any]) -> str:
 
 
 def _asks(own: dict[str, Any]) -> str:
-    """Return in words what a Slurm job asks for; empty outside of Slurm."""
+    """Describe what a Slurm job asks for; empty outside of Slurm."""
     memory, minutes = own.get("memory_mb"), own.get("minutes")
     limit = minutes and f"{minutes:,} minute{'s' if minutes > 1 else ''}"
     return " and ".join(filter(None, (memory and f"{memory:,} MB", limit)))

@@ -209,7 +209,7 @@ def _tried(what: str, code: str, answer: str, success: str, llvm: str = "") -> F
     if child.returncode == 0:
         return Finding("FAIL", what, f"computed {child.stdout.strip()!r} instead of {answer!r}", INSTALL)
     errors = [line for line in child.stderr.splitlines() if re.search(r"error|cannot|not be", line, re.IGNORECASE)]
-    # Dr.Jit hides what it could not load behind an error of its own.
+    # Dr.Jit raises its own error, which hides the library that it could not load.
     lacking = [line for line in errors if "cannot open shared object" in line]
     reason = (lacking or errors or child.stderr.strip().splitlines() or [""])[-1].strip()[:300]
     if child.returncode < 0:

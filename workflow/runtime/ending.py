@@ -73,6 +73,6 @@ def guarded(what: str, run: Callable[[], object], state: JobState | None = None)
     else:
         return 0
     if state:
-        with suppress(OSError):  # a full disk has been told of
+        with suppress(OSError):  # a full disk has been reported already
             state.failed(reason)
     return code

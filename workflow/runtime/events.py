@@ -29,7 +29,7 @@ EVERY = 30.0
 """Seconds between two events `progress` of a job."""
 LONGEST = 4000
 """Bytes of a line: the kernel appends what fits into a page in one piece."""
-_told = float("-inf")  # when this process last told its progress
+_told = float("-inf")  # when this process last reported its progress
 
 
 def place(named: str) -> Path:
@@ -42,7 +42,7 @@ def checked(named: str, tried: bool = True) -> str:
 
     Args:
         named: as it was given.
-        tried: whether it is seen if something can be written there. A job on a node goes on without events where it cannot.
+        tried: whether to check that something can be written there. A job on a node runs without events where it cannot.
 
     Raises:
         InputError: nothing can be written there.
@@ -127,7 +127,7 @@ def line_of(document: dict[str, Any]) -> bytes:
 
 
 def due() -> bool:
-    """Return whether the progress of this job is to be told now: events are wanted, and the last was told `EVERY` seconds ago."""
+    """Return whether this job reports its progress now: events are wanted, and its last report is `EVERY` seconds old."""
     global _told
     now = time.monotonic()
     if VARIABLE not in os.environ or now - _told < EVERY:

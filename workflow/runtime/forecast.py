@@ -1,4 +1,4 @@
-"""What Snakemake is told about each job, and what a person reads before the jobs start."""
+"""The resources that Snakemake gets for each job, and the forecast that a person reads before the jobs start."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from workflow.runtime import fingerprint as fingerprints
 
 MEMORY_MARGIN = 1.1
 BESIDE_MB = 150
-"""MB that are added on a cluster, where each job has a Snakemake process beside it (docs/development/costs.md)."""
+"""MB that are added on a cluster, where a Snakemake process runs with each job (docs/development/costs.md)."""
 TIME_MARGIN, TIME_LEAST = 4.0, 10
 """A scheduler ends a job that takes longer than it said, so this is generous, and minutes."""
 UNKNOWN_MEMORY, UNKNOWN_MINUTES, UNKNOWN_DISK = 12_000, 720, 20_000
 """Of kinds of jobs that nobody has measured yet: priors that are networks, and segmentation by masks of a network."""
 START, START_OF_JOB = 5.0, 0.9
-"""Wall seconds that Snakemake takes to start, and for the start of each job beside what the job measures itself."""
+"""Wall seconds that Snakemake takes to start, and that the start of a job adds to what the job measures itself."""
 ONE_THREAD = ("export", "report", "publish")
 """Stages whose rules take one thread; the others take two."""
 COMPILATION = {"base": 15.0, "affines": 15.0}
@@ -94,7 +94,7 @@ def _rounded(mb: float) -> int:
 
 
 class Wall(NamedTuple):
-    """Wall time of a whole scene from its photographs to scenes/<scene>, and what is not counted in it, in words."""
+    """Wall time of a whole scene from its photographs to scenes/<scene>, and a text about what it does not count."""
 
     seconds: Range
     beside: str
@@ -121,11 +121,11 @@ def wall(scene: str, quality: str, cores: int) -> Wall:
                 f"scene {scene}: how long stage {stage.name} takes with {kind!r} was never measured, so no time can be promised;"
                 " choose a quality by name, or fit the costs to a finished run (docs/development/costs.md)"
             )
-        # One after the other: nothing of one scene fits beside a job of two threads.
+        # The jobs of a scene run one after the other: no second one fits next to a job of two threads.
         more = START_OF_JOB + _compilation(stage.name)
         total = [sum_ + part + more for sum_, part in zip(total, cost.seconds, strict=True)]
     making = job_cost("capture", scene, quality, min(2, cores)).seconds if rendered else None
-    beside = f", beside some {duration(making.middle)} to render the photographs" if making else ""
+    beside = f", plus about {duration(making.middle)} to render the photographs" if making else ""
     return Wall(Range(*total), beside)
 
 
@@ -139,7 +139,7 @@ def _compilation(stage: str) -> float:
 
 
 def span(seconds: Range) -> str:
-    """Return a range of seconds in words."""
+    """Return a range of seconds as text."""
     return _span(seconds.low, seconds.high, duration)
 
 
@@ -206,7 +206,7 @@ def _span(low: float, high: float, show: Any) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return seconds in words.
+    """Return seconds as text.
 
     >>> [duration(x) for x in (0.4, 42.4, 100, 4000)]
     ['1 s', '42 s', '1 min 40 s', '1 h 7 min']
@@ -220,7 +220,7 @@ def duration(seconds: float) -> str:
 
 
 def size(mb: float) -> str:
-    """Return megabytes in words.
+    """Return megabytes as text.
 
     >>> [size(x) for x in (0.3, 812, 1234)]
     ['1 MB', '812 MB', '1.2 GB']
@@ -229,6 +229,6 @@ def size(mb: float) -> str:
 
 
 def expected(cost: Cost) -> dict[str, float]:
-    """Return the middles of a cost, as they are kept beside what the job took."""
+    """Return the middle of each range of a cost. It is stored together with what the job took."""
     names: Mapping[str, Range | None] = cost._asdict()
     return {name: round(found.middle, 3) for name, found in names.items() if found}

@@ -45,7 +45,7 @@ class Job:
     """What the `run(job)` of a stage receives.
 
     Attributes:
-        name: of the job: that of its stage, or `prior.3-of-8` if it makes a part alone.
+        name: of the job: the name of its stage, or such as `prior.3-of-8` if the job makes only a part.
         settings: the parts of the settings tree that the registry lists for this stage, by attribute (`job.settings.base.ridge`);
             any other raises AttributeError.
         seed: seed of the scene, if the registry lists it.
@@ -64,7 +64,7 @@ class Job:
         self._progress_of, self._first_item = "", (0, self._started)
         self._cpu_started = time.process_time()
         self._parts: dict[str, dict[str, float]] = {}
-        self._earlier = {"seconds": 0.0, "cpu_seconds": 0.0}  # of runs that were killed, and from which this one goes on
+        self._earlier = {"seconds": 0.0, "cpu_seconds": 0.0}  # of killed runs that this one continues
         self._readers: dict[tuple[str, str], StageReader] = {}
 
     @cached_property

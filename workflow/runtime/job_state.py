@@ -1,11 +1,11 @@
-"""How the last run of a job ended, kept beside its log, so that the next attempt, the end of a run and the summary of a batch can
-give the reason.
+"""How the last run of a job ended. The file lies next to the log of the job; the next attempt, the end of a run and the summary
+of a batch read the reason from it.
 
-`results/<scene>/logs/<stage>.state.json` exists from the start of a job until it ends well. The file of a job that was killed
-says `started`; that of a job that failed says `failed` and why. `since` is when it came into that state, `host` and `pid` say
-where it runs; with these and the time stamp of the file, which a running job renews, a running job is told from a killed one.
-With them stand the facts of its attempts (`attempts.py`) and the memory that the process had when it was last seen (`peak_mb`). A
-job that needed several attempts leaves `<stage>.attempts.json` also when it ends well.
+`results/<scene>/logs/<stage>.state.json` exists from the start of a job until it ends well. It says `started` for a job that was
+killed, and `failed` and why for a job that failed. `since` is when the job came into that state; `host` and `pid` say where it
+runs. These and the time stamp of the file, which a running job renews, distinguish a running job from a killed one. The file also
+holds the facts of the attempts (`attempts.py`) and the memory that the process had when it was last seen (`peak_mb`). A job that
+needed several attempts leaves `<stage>.attempts.json` also when it ends well.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class JobState:
             if not grown and time.monotonic() < renewed + alive.BEAT:
                 continue
             renewed = time.monotonic()
-            with self._lock, suppress(OSError):  # a full disk will be told of by the stage
+            with self._lock, suppress(OSError):  # the stage will report a full disk
                 if self._ended.is_set() or not path.exists():  # it is removed with its results
                     continue
                 if grown:

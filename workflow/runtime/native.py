@@ -3,7 +3,7 @@
 Dr.Jit compiles through a shared libLLVM. With LLVM 15 it aborts the whole process in the first kernel ("Cannot select
 fminimum") instead of raising an error, and without LLVM it fails only when a variant is chosen. Therefore the library is
 found and its version is asked here, in a child process, before Dr.Jit is imported. Open3D needs libusb although no camera is ever
-opened; where the system has none, that of the `libusb-package` wheel is loaded under its soname.
+opened; where the system has no libusb, the one in the `libusb-package` wheel is loaded under its soname.
 
 Only the standard library is used, and importing this module changes nothing.
 """

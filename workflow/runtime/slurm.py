@@ -31,11 +31,11 @@ KILLED = {
 ENDED = (*KILLED, "COMPLETED", "FAILED", "REVOKED")
 """States that a job does not leave by itself; in any other, such as STAGE_OUT or RESV_DEL_HOLD, it is still Slurm's."""
 STUCK = ("launch_failed_requeued_held", "BadConstraints")
-"""Reasons of a job that waits for which Slurm will never start it by itself. One that a person holds goes on waiting."""
+"""Reasons for which Slurm will never start a waiting job by itself. A job that a person holds is not stuck; it keeps waiting."""
 LOGS = ".snakemake/slurm_logs"
 """Where Slurm writes what jobs say."""
 REFUSALS = f"{LOGS}/refused.log"
-"""What `sbatch` says when it refuses a job of the executor cluster-generic, which does not tell that of a group of jobs."""
+"""What `sbatch` says when it refuses a job of the executor cluster-generic, which does not report it for a group of jobs."""
 REFUSED = re.compile(r"sbatch failed\. The error message was '(.*?)'\.\n\s+sbatch call:", re.S)
 """What the executor slurm logs when Slurm refuses a job."""
 
@@ -193,7 +193,7 @@ class Asked(NamedTuple):
     """What a job asks of one node.
 
     Attributes:
-        what: the job, in words.
+        what: description of the job.
         rules: rule -> cores; of a job that runs several stages, each of them.
         cores, memory_mb: of the whole job; memory None = whatever there is.
         partitions: names; empty = the default one.

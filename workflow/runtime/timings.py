@@ -64,7 +64,7 @@ def _numbers(facts: dict[str, Any]) -> dict[str, float]:
 
 
 def _threads(benchmark: Path) -> str:
-    """Return what `python -m workflow` wrote beside the benchmark, because Snakemake's short format has no threads."""
+    """Return the threads that `python -m workflow` wrote next to the benchmark; Snakemake's short format does not have them."""
     try:
         return read_record(benchmark.with_suffix(".threads")).decode()
     except (OSError, ValueError):

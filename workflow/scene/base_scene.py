@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 
 SECOND_LOOK = "second_look.json"
-"""Says whether stage second_look made a base of its own."""
+"""Says whether stage second_look made its own base."""
 
 
 def read_base(job: Job) -> StageReader:
-    """Return the base texture that a stage starts from: that of the second look, if one was made before the stage."""
+    """Return the base texture that a stage starts from: the texture of the second look, if one was made before the stage."""
     if "second_look" in job.stage.upstream:
         again = job.read("second_look")
         if again.json(SECOND_LOOK)["made"]:

@@ -365,7 +365,7 @@ def choose_rows(
         parts.append((part, record.base[choice], rows))
     pixels, base, rows = (list(part) for part in zip(*parts, strict=True))
     every, shown = joined(pixels), joined(rows)
-    # Border pixels mix with what is beside the emitter; they are used only for emitters that have no others.
+    # Border pixels mix the emitter with its surroundings; they are used only for emitters that have no other pixels.
     group = shown.group
     inner = np.bincount(group[every.interior & (group >= 0)], minlength=groups.size) > 0
     use = (group < 0) | every.interior | ~np.append(inner, False)[group]

@@ -170,7 +170,7 @@ def search_emitters(
 
     pruned: of the trial, for all `groups`; certain: brightness relative to a white surface from which a group shines for certain;
     hits: (F,) rays from visible surface that meet each face.
-    Returns the problem of the emitters, which of `groups` are among them, and what was changed, in words.
+    Returns the problem of the emitters, which of `groups` are among them, and a description of what was changed.
     """
     # Groups were dropped one after the other; of some the light was given to others, and they may be needed after all.
     offered = np.flatnonzero(pruned.may_shine(certain, photos.job.settings.emission.prune)[: groups.size])
@@ -338,7 +338,7 @@ def comparison_tile(photos: Photographs) -> int:
 
 
 def _names(photos: Photographs, groups: EmitterGroups, family: np.ndarray, number: int) -> str:
-    """A family in words: its object, and whether a camera sees it."""
+    """Describe a family: its object, and whether a camera sees it."""
     own = np.flatnonzero(family == number)
     thing = int(photos.scene.object_id[np.flatnonzero(groups.of_face == own[0])[0]])
     table = photos.job.read("segmentation").table("objects.parquet")

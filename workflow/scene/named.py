@@ -35,8 +35,8 @@ def object_number(key: object, names: list[str], where: str) -> int:
 
 @lru_cache(None)
 def check_overrides(stage: str, scene: str, quality: str) -> None:
-    """Check the objects that `overrides` names, once the segmentation is known: before the work of any stage after it, not before
-    that of stage `affines`, which is the first to use them.
+    """Check the objects that `overrides` names, once the segmentation is known. Every later stage checks them before its work,
+    not only stage `affines`, which is the first to use them.
 
     Raises:
         InputError: as `object_number`.

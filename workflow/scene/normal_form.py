@@ -164,7 +164,7 @@ class CaptureWriter:
             source: kind of the source.
             dynamic_range: `ldr` or `hdr`.
             has_truth: whether ground truth was written for all views.
-            notes: what was approximated or corrected, in words.
+            notes: what was approximated or corrected, as text.
             response_truth: (3, 101) samples of the true camera response on [0, 1], where it is known.
             facts: further entries of the document.
         """

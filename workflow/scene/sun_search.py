@@ -99,7 +99,7 @@ class _Rows:
 
     @classmethod
     def traced(cls, photos: Photographs, sky: Sky, cache: RadianceVoxels, threshold: float, tile_edge: int, rows: int) -> _Rows:
-        """Trace `rows` pixels, to be averaged in tiles; the cache is that of all surface."""
+        """Trace `rows` pixels, to be averaged in tiles; the cache covers all surface."""
         none = EmitterGroups.none(len(photos.scene.faces))
         thin = -(-photos.job.settings.emission.rows // rows)
         pixels, base, shown = choose_rows(photos, none, threshold, thin, tile_edge)

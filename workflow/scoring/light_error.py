@@ -32,8 +32,8 @@ def light_error(job: Job, capture: CaptureReader, views: list[View]) -> list[Sco
 def _pixels(
     job: Job, capture: CaptureReader, view: View, sheer: np.ndarray, levels: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """True radiance and that of the true materials under the computed light, (n, 3) each, and objects (n,), where specular light
-    was traced; and the objects of all pixels that count."""
+    """Return, where specular light was traced, the true radiance and the radiance of the true materials under the computed light,
+    (n, 3) each, and objects (n,); and the objects of all pixels that count."""
     truth, maps = capture.truth(view), job.read("segmentation").exr(f"maps/{view.name}.exr")
     face, object_id = capture.gbuffer(view)[1], ids_from_disk(maps["object.id"])
     use = truth.valid & (face >= 0) & (object_id >= 0) & (maps["interior"] > 0.5) & ~sheer[np.maximum(face, 0)]

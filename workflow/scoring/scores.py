@@ -173,7 +173,7 @@ def interval_scores(
 ) -> Iterator[tuple[str, list[Score]]]:
     """Compute the share of the cells whose error lies within the interval that the base claims (Eq. E.11 to E.13).
 
-    `cells` is the table base/cells.parquet, `truth` that of `cell_truth`, `predictions` K. The columns `uncertainty_*` are
+    `cells` is the table base/cells.parquet, `truth` is from `cell_truth`, `predictions` is K. The columns `uncertainty_*` are
     standard deviations of the error under one affine per object over all views (protocol `oracle_affine`); protocol `raw` does
     without the affine. Objects of few cells are left out, because their affine follows the errors. `psnr_3d` is over cells, with
     one affine per object for all views.

@@ -3,7 +3,7 @@
 A plug-in is a module `workflow/segmentations/<kind>.py` with
 
     segment(surface, settings, fold) -> Objects
-    PERTURBED                            what the perturbed runs change, in words
+    PERTURBED                            what the perturbed runs change, as text
     perturbs(surface) -> bool            whether they change anything
 
 `surface` holds mesh and photographs (workflow/segmentations/surface.py), and `settings` are the sections that stage segmentation

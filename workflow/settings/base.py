@@ -66,7 +66,7 @@ class Base(Section):
     median_gradient: bool | None = None
     """`sgd`: follow the derivative of the median over the predictions; default: no, `preset: paper` yes."""
     judge: bool = False
-    """Evaluate the paper's loss of the result, and for `sgd` also that of `direct` at the same selection (base.json)."""
+    """Evaluate the paper's loss of the result, and for `sgd` also the loss of `direct` at the same selection (base.json)."""
 
     @model_validator(mode="after")
     def _known_pairs(self) -> Base:

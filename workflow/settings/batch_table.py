@@ -159,7 +159,7 @@ def _problem_of_cells(cells: list[str], header: list[str], text: str) -> str:
 
 
 def _instead_of_tabs(text: str) -> str:
-    """Return in words what a line has instead of tabs; empty if it has tabs, or one word alone."""
+    """Name what a line has instead of tabs; empty if it has tabs, or only one word."""
     if "\t" in text:
         return ""
     found = next((name for sign, name in ((",", "commas"), (";", "semicolons")) if sign in text), "")
@@ -192,9 +192,9 @@ def _problem_of_file(line: Line, folder: Path) -> str:
 
 
 def find(name: str, root: Path = Path(".")) -> Line | None:
-    """Return the line that describes a scene; None for a scene with a file of its own, of a study, or not in the table.
+    """Return the line that describes a scene; None for a scene with its own file, of a study, or not in the table.
 
-    Mistakes in other lines do not count, so that the jobs of a run go on while somebody writes the table.
+    Mistakes in other lines do not count, so that the jobs of a run continue while somebody edits the table.
 
     Raises:
         InputError: a mistake in the lines of this scene, or the whole table cannot be read.
@@ -277,7 +277,7 @@ def parse_overrides(text: str, where: str = "overrides") -> dict[str, Any]:
                 f"{where}: found {shown(entry)}, needed key=value with a dotted key, such as capture.views=24;prior.samples=8"
             )
         if key in ("source.kind", "source.path"):
-            raise InputError(f"{where}: {key!r} has a column of its own, {'source' if key.endswith('kind') else 'path'}")
+            raise InputError(f"{where}: {key!r} has its own column, {'source' if key.endswith('kind') else 'path'}")
         for other in seen:
             if key == other:
                 raise InputError(f"{where}: {key!r} stands twice")

@@ -113,7 +113,7 @@ def _number(value: float) -> str:
 
 
 def needed(problem: Any) -> str:
-    """Return what a value should have been, in words of our own where pydantic's error is about a type, a limit or a choice."""
+    """Return what a value should have been. Our text replaces pydantic's where its error is about a type, a limit or a choice."""
     limits = problem.get("ctx", {})
     bound = next((f"{words} {_number(limits[name])}" for name, words in BOUNDS.items() if name in limits), None)
     if problem["type"] in NEEDED:

@@ -175,8 +175,8 @@ def _quality(quality: str, root: Path) -> dict[str, Any]:
     below = read_yaml(configuration(f"quality/{point}.yaml", root)) if point in names else {"point": None}
     if "point" in below:
         raise InputError(
-            f"config/quality/{quality}.yaml: `point`: found {point!r}; needed is the name of a file beside it that has no `point`"
-            " itself, such as p01"
+            f"config/quality/{quality}.yaml: `point`: found {point!r}; needed is the name of a file next to it that has no"
+            " `point` itself, such as p01"
         )
     return merge(below, own)
 
@@ -223,7 +223,7 @@ def overridden(scene: str, quality: str, root: Path = Path(".")) -> list[str]:
 
 
 def photographs(quality: str, root: Path = Path(".")) -> str:
-    """Return in words how many photographs a quality takes, and at which size.
+    """Describe how many photographs a quality takes, and at which size.
 
     Raises:
         InputError: an unknown quality, or one whose file says something else than numbers there.

@@ -1,6 +1,6 @@
-"""Files of meshes that can be put into a room: which there are, what they need beside them, and what is wrong with them.
+"""Files of meshes that can be put into a room: the formats, the files that they need next to them, and what is wrong with them.
 
-What the headers tell is told here, before any job; the mesh itself is read by `workflow.relighting.inserts`.
+This module checks the headers, before any job; `workflow.relighting.inserts` reads the mesh itself.
 """
 
 from __future__ import annotations

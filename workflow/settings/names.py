@@ -27,10 +27,10 @@ RESERVED = ("batch", "studies", "weights")
 
 
 def configuration(part: str, root: Path = Path(".")) -> Path:
-    """Return `config/<part>` of the working folder where it exists, otherwise that of the repository.
+    """Return `config/<part>` of the working folder where it exists, otherwise `config/<part>` of the repository.
 
-    A working folder with a `config/scenes/` of its own uses its own scenes only. The paths inside a scene file always count
-    from the working folder.
+    A working folder that has a `config/scenes/` uses only the scenes in it. The paths inside a scene file always count from the
+    working folder.
     """
     own = root / "config" / part
     return own if own.exists() else REPOSITORY / "config" / part
@@ -72,7 +72,7 @@ def did_you_mean(name: object, known: Iterable[str], form: str = "{}") -> str:
 
 
 def did_you_mean_path(path: Path) -> str:
-    """Return ` Did you mean X?` where the first missing part of `path` has a similar name beside it, or what is said of a `~`;
+    """Return ` Did you mean X?` where the folder of the first missing part of `path` holds a similar name, or the hint for a `~`;
     otherwise empty."""
     if path.parts[:1] and path.parts[0].startswith("~"):
         return " `~` is not expanded here; write the whole path."

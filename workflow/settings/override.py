@@ -20,7 +20,7 @@ class Components(Section):
     """Specular lobes; without them nothing is metal, and re-renderings end in photographed
     radiance, if the radiance cache is in."""
     metallic: Annotated[Literal["auto", "off"], ON_OFF] = "auto"
-    """Metals among the objects, told apart by the fit; `off`: every object is a dielectric."""
+    """The fit decides which objects are metals; `off`: every object is a dielectric."""
     radiance_cache: Choice = "auto"
     """Indirect light from photographed surface, as `shading: {indirect: cache}`; `off` as `path`."""
     denoiser: Choice = "auto"
@@ -35,7 +35,7 @@ class Override(Section):
 
 
 class GivenMaterial(Section):
-    """What is known of the material of an object. It is not fitted, and the fit of everything else goes on with it
+    """What is known of the material of an object. It is not fitted; everything else is fitted with it
     (docs/guide/relighting.md#corrections-by-hand)."""
 
     roughness: float | None = Field(None, ge=0.02, le=1)
@@ -48,7 +48,7 @@ class GivenMaterial(Section):
     def _no_albedo(cls, value: Any) -> Any:
         if isinstance(value, dict) and "albedo" in value:
             raise ValueError(
-                "albedo is not given by hand here, because its level is one with that of the light: use"
+                "albedo cannot be given by hand here, because its level is tied to the level of the light: use"
                 " `affines: {scale: {white_patch: {object: ..., albedo: ...}}}`, or paint the object in a relighting"
             )
         return value

@@ -58,7 +58,7 @@ class MaterialEdit(Section):
     """Other paint on one object. What is not named stays as it was recovered."""
 
     albedo: tuple[Reflectance, Reflectance, Reflectance] | None = None
-    """Linear R, G, B of flat paint; the texture is gone."""
+    """Linear R, G, B of flat paint; it replaces the texture."""
     tint: Colour | None = None
     """Factors on R, G, B of the albedo; the texture stays."""
     roughness: float | None = Field(None, ge=0.02, le=1)
@@ -92,7 +92,7 @@ class RelightInsert(Section):
     file: Path
     """Mesh: `.glb`, `.gltf`, `.ply` or `.obj`. The y axis of glTF files is turned to the up axis of the room."""
     name: str | None = None
-    """Name in captions and of its light; by default that of the file."""
+    """Name in captions and of its light; by default the name of the file."""
     position: tuple[float, float, float]
     """Where it stands: the middle of its lowest side, in metres, world axes."""
     rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -146,9 +146,9 @@ class RelightCamera(Section):
     fov: float | None = Field(None, gt=1, lt=170)
     """Horizontal field of view in degrees; by default as photographed."""
     width: int | None = Field(None, ge=8, le=8192)
-    """Width in pixels; by default that of the first view."""
+    """Width in pixels; by default the width of the first view."""
     height: int | None = Field(None, ge=8, le=8192)
-    """Height in pixels; by default that of the first view."""
+    """Height in pixels; by default the height of the first view."""
     through_surface: bool = False
     """Let the path lead through walls and furniture; otherwise it is an error that names what is in the way."""
 
@@ -191,10 +191,10 @@ class Relighting(Section):
     camera: RelightCamera = RelightCamera()
     """From where the pictures are taken."""
     exposure: Literal["photograph", "auto"] | Annotated[float, Field(gt=0)] = "photograph"
-    """Factor on radiance before the camera response. `photograph`: that of the first view, so that pictures compare with it;
-    `auto`: by the brightness of the first frame; or a number."""
+    """Factor on radiance before the camera response. `photograph`: the factor of the first view, so that pictures compare
+    with it; `auto`: by the brightness of the first frame; or a number."""
     response: Literal["camera", "srgb"] = "camera"
-    """Through which curve radiance becomes pictures: that of the photographs, or sRGB. HDR photographs have none."""
+    """Curve that turns radiance into pictures: the response of the photographs, or sRGB. HDR photographs have none."""
     video: RelightVideo | None = RelightVideo()
     """The frames of a flight as an MP4 file as well; `off`: none."""
     method: Literal["auto", "recombine", "path"] = "auto"
@@ -248,7 +248,7 @@ def _named_apart(entries: list[Relighting]) -> list[Relighting]:
     names = [entry.name for entry in entries]
     twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
     if twice:
-        raise ValueError(f"{names.count(twice[0])} relightings are called {twice[0]!r}; every one needs a name of its own")
+        raise ValueError(f"{names.count(twice[0])} relightings are called {twice[0]!r}; each needs its own name")
     return entries
 
 
@@ -287,7 +287,7 @@ def files_of(entry: dict[str, Any]) -> list[Path]:
 
 
 def name_of(insert: dict[str, Any]) -> str:
-    """Return the name of a dumped inserted object: its own, or that of its file."""
+    """Return the name of a dumped inserted object: its own, or the name of its file."""
     return insert["name"] or Path(insert["file"]).stem
 
 

@@ -21,7 +21,7 @@ def plan_names(root: Path = Path(".")) -> list[str]:
 
 
 def active_plan(scene: str, root: Path = Path(".")) -> str:
-    """Return the plan of a scene whose file has no relightings: that of its own name, otherwise the example."""
+    """Return the plan of a scene whose file has no relightings: the plan with the name of the scene, otherwise the example."""
     return scene if scene in plan_names(root) else EXAMPLE
 
 
@@ -53,8 +53,8 @@ def plan_layer(plan: str, root: Path = Path(".")) -> tuple[str, dict[str, Any]]:
 
 
 def _beside(entry: Any, folder: Path) -> Any:
-    """Return an entry whose files that are not in the working folder are looked for beside the plan. What is no entry is left to
-    the check of the settings."""
+    """Return an entry with the paths of its files; those that are not in the working folder are looked for next to the plan. The
+    check of the settings handles what is no entry."""
     if not isinstance(entry, dict):
         return entry
     out = dict(entry)

@@ -128,8 +128,8 @@ class SceneSettings(Section):
 
     @model_validator(mode="after")
     def _automatic_shading(self) -> SceneSettings:
-        """Put the number, or `all`, in the place of `shading: {pixels: auto}`, and the number in that of `noise: auto`: what is
-        traced follows from what is read."""
+        """Replace `shading: {pixels: auto}` by the number or `all`, and `noise: auto` by the number: what is traced follows from
+        what is read."""
         textured = self.affines.model == "objects" and textures_cells(self.affines.texture, self.prior.kind)
         every = textured or self.affines.model in FREE_CELLS or self.affines.pixels == "all"
         asked, needed = self.shading.pixels, "all" if every else self.affines.pixels

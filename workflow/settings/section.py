@@ -40,7 +40,7 @@ ON_OFF = BeforeValidator(lambda value: ("off", "on")[value] if isinstance(value,
 
 
 class Section(BaseModel):
-    """A part of the settings. Unknown keys are errors, and so are numbers that are not finite, and keys without effect beside the
+    """A part of the settings. Unknown keys are errors. So are numbers that are not finite, and keys that have no effect with the
     chosen solver or model."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)

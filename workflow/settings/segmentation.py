@@ -29,7 +29,7 @@ class PiecesOfMesh(SegmentationBase):
     min_area: float = Field(0.01, ge=0)
     """Area in m^2 from which a piece of the mesh stays as it is, however few faces it has."""
     colour: float = Field(0.1, ge=0)
-    """Pieces of the mesh: weight of differences in colour between faces beside that of the angle between them (0 = shape
+    """Pieces of the mesh: weight of differences in colour between faces, relative to the angle between them (0 = shape
     alone)."""
 
 
@@ -69,7 +69,7 @@ class MaskSegmentation(PiecesOfMesh):
     visible: float = Field(0.3, gt=0, le=1)
     """Share of a mask that a view must see for its masks to be compared with it."""
     contained: float = Field(0.8, gt=0, le=1)
-    """A view supports a mask if one of its own masks contains more than this share of the visible part."""
+    """A view supports a mask if a mask of the view contains more than this share of the visible part."""
     split: float = Field(0.5, gt=0, le=1)
     """A mask that more than this share of the views split is dropped, because it holds several objects. A smaller value gives
     finer objects."""

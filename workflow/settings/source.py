@@ -89,7 +89,7 @@ class ScanNetppSource(PhotographedSource):
     lists: Literal["all", "train"] = "all"
     """`all`: hold out the photographs of the test list; `train`: leave them out."""
     world: Literal["nerfstudio", "mesh"] = "nerfstudio"
-    """Frame of the poses in transforms.json: as released (rotated against the mesh), or that of the mesh."""
+    """Frame of the poses in transforms.json: as released (rotated against the mesh), or the frame of the mesh."""
     drop_bad: bool = True
     """Leave out photographs that the release marks as bad (`is_bad`)."""
 

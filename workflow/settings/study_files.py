@@ -154,7 +154,7 @@ class Study(Section):
     protocols: list[catalogue.ProtocolName] = Field(["raw", "oracle_affine"], min_length=1)
     """Protocols in the printed table and the picture; the Parquet file has all."""
     rows: Literal["variants", "scenes"] = "variants"
-    """Rows of the printed tables; with `scenes` each protocol has a table of its own."""
+    """Rows of the printed tables; with `scenes` each protocol has its own table."""
     common: dict[str, dict[str, Any]] = {}
     """Settings of all variants; those of a variant override them."""
     shared: dict[str, dict[str, Any]] = {}
@@ -229,7 +229,7 @@ def _load_study(path: Path, file: Path, root: Path, _stamp: int) -> Study:
     for i, grid in enumerate(study.grids):
         for name, variant in _grid(grid, f"{path}: `grids.{i}`").items():
             if name in variants:
-                raise InputError(f"{path}: `grids.{i}`: variant {name} is there already; give each a setting of its own")
+                raise InputError(f"{path}: `grids.{i}`: variant {name} is there already; give each its own setting")
             variants[name] = variant
     if study.design:
         variants |= _design(study.design, path, variants)
@@ -357,7 +357,7 @@ def scenes_path(root: Path = Path(".")) -> Path:
 
 
 def scene_overrides(root: Path = Path(".")) -> dict[str, dict[str, Any]]:
-    """Return scene -> settings that every study uses for it; an entry with a `source` needs no scene of its own."""
+    """Return scene -> settings that every study uses for it; an entry with a `source` needs no scene of that name."""
     path = scenes_path(root)
     if not path.is_file():
         raise InputError(f"{SCENES}: not found; it lists the scenes of the studies (docs/development/studies.md)")
@@ -375,7 +375,7 @@ def scene_overrides(root: Path = Path(".")) -> dict[str, dict[str, Any]]:
 
 
 def derived(name: str, root: Path = Path(".")) -> Derived | None:
-    """Return the parts of the name of a derived scene; None for a scene with a file of its own, or for any other name."""
+    """Return the parts of the name of a derived scene; None for a scene with its own file, or for any other name."""
     if "--" not in name or scene_path(name, root).is_file():
         return None
     match = _DERIVED.fullmatch(name)
@@ -413,9 +413,9 @@ def layers(parts: Derived, root: Path = Path(".")) -> list[tuple[str, dict[str, 
 def bases(name: str, root: Path = Path(".")) -> list[str]:
     """Return the derived scenes whose folders may hold results that `name` shares, the most general first.
 
-    These are what all studies share, then the variants of its own study up to itself, with the first seed and with its own. A
-    variant that differs late, such as a baseline of the material fit, thus finds everything before it in the folder of the
-    first variant.
+    These are what all studies share, then the variants of the same study up to `name`, with the first seed and with the seed of
+    `name`. A variant that differs late, such as a baseline of the material fit, thus finds everything before it in the folder of
+    the first variant.
     """
     parts = derived(name, root)
     if parts is None or parts.study == BENCH:

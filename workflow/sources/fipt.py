@@ -40,7 +40,7 @@ class Listed:
         flip: (4, 4), from OpenCV's camera axes to those of the entries.
         homes: folders of photographs.
         also: further files that were read.
-        notes: what was left out, in words.
+        notes: what was left out, as text.
     """
 
     path: Path

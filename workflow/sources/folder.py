@@ -335,7 +335,7 @@ class _Capture:
         alignment.raise_or_note(warning, "warn", self.notes)
 
     def _advice(self, seen: list[tuple[Frame, View]]) -> str:
-        """Return which other convention fits the depth images or sparse points, in words; empty without them."""
+        """Say which other convention fits the depth images or sparse points; empty without them."""
         pairs = [(f, _pinhole(v)) for f, v in seen if f.depth is not None or (f.seen is not None and len(f.seen))]
         if not pairs:
             return ""
@@ -356,7 +356,7 @@ class _Capture:
         self.trials.append((frame, small, *images.reduce_area(photo, valid, small.width, small.height)))
 
     def _edge_advice(self) -> str:
-        """Return which other convention fits the edges of the photographs clearly better, in words."""
+        """Say which other convention fits the edges of the photographs clearly better."""
         known = self.inputs.transforms.known
         now = self.alignment.report()["edge_correlation"]
         return alignment.explain_edges(self.trials, self._surface_along, self.conventions, known, now)

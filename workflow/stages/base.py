@@ -195,7 +195,7 @@ def _solve(job: Job, problem: FusionProblem) -> tuple[FusionResult, SgdFit | Non
             kept = job.kept_state("descent")
             if kept is None:
                 return None
-            job.log.info("the descent goes on from step %d", kept[1]["step"])
+            job.log.info("the descent continues from step %d", kept[1]["step"])
             return SgdState(*kept)
 
         def keep(state_of: Callable[[], SgdState]) -> None:
@@ -295,7 +295,7 @@ def _pixels(
 
 
 def _judged(job: Job, problem: FusionProblem, result: FusionResult, fit: SgdFit | None) -> dict[str, dict[str, float]]:
-    """The paper's loss of the result, and for `sgd` also that of `direct` with the same objective and selection.
+    """The paper's loss of the result, and for `sgd` also the loss of `direct` with the same objective and selection.
 
     Every pixel counts 1, as in the paper. `direct` solves with `border_weight`, which must be 1 for an exact comparison.
     """

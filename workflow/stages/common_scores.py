@@ -43,7 +43,7 @@ def run(job: Job) -> None:
     scene = read_recovered(job)
     if len(shared.mesh()[1]) != len(scene.surface.faces):
         raise InputError(
-            f"{job.read_shared('capture').directory}: a mesh of {len(shared.mesh()[1])} faces, that of {job.scene} has"
+            f"{job.read_shared('capture').directory}: its mesh has {len(shared.mesh()[1])} faces, the mesh of {job.scene} has"
             f" {len(scene.surface.faces)}. Variants that divide the mesh differently cannot share views."
         )
     networks = scoring.perceptual_networks()

@@ -76,7 +76,7 @@ def _up(capture: CaptureReader) -> np.ndarray:
 
 
 def _texture_facts(job: Job, parts: list[TexturedPart], seen: np.ndarray, covered: np.ndarray, size: int) -> dict[str, Any]:
-    """What the textures lost: size of a texel beside that of a surface cell, and how much surface no photograph shows."""
+    """What the textures lost: the sizes of a texel and of a surface cell, and how much surface the photographs show."""
     unwrapped, table = job.read("unwrap").json("unwrap.json"), job.read("unwrap").table("parts.parquet")
     shown = [p for p, part in enumerate(parts) if part.emitter_id < 0]
     density = np.asarray(table["texels_per_m"])[shown]

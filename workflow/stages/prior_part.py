@@ -1,7 +1,7 @@
-"""A part of stage prior: predictions of some of the views, made by a job of its own, perhaps on another node.
+"""A part of stage prior: a separate job, perhaps on another node, makes the predictions of some of the views.
 
-Stage prior takes over what is on disk, as it does after a kill, so its result does not depend on whether there were parts. This
-module is apart from that of the stage so that fingerprints know nothing of it.
+Stage prior takes over what is on disk, as it does after a kill, so its result does not depend on whether there were parts. The
+module of the stage does not import this one, so fingerprints do not depend on it.
 """
 
 from __future__ import annotations

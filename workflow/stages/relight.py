@@ -180,7 +180,7 @@ def _write(job: Job, name: str, radiance: Array, picture: Array) -> None:
 
 @dataclass(frozen=True)
 class _Display:
-    """Makes pictures of radiance: factor (3,), then the curve. `source`: where the exposure is from, in words."""
+    """Turns radiance into pictures: factor (3,), then the curve. `source`: text that says where the exposure is from."""
 
     factor: Array
     curve: Response

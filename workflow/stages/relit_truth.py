@@ -67,7 +67,7 @@ def run(job: Job) -> None:
                     image = denoise(image, truth.albedo, _seen_normals(normals, face_id, view))
                 images.append(image.astype(np.float32))
             mask = valid & truth.valid & (face_id >= 0)
-            if light.shift is not None:  # what the lamp hid has no truth, and the denoiser is told of the lamp there
+            if light.shift is not None:  # what the lamp hid has no truth: the denoiser's guides show the lamp there
                 mask &= ~np.isin(face_id, next(lamp.faces for lamp in setup.lamps if lamp.lamp == light.lamp))
             pictures.append((view, images, mask))
         reason = _useless(light, setup, [(images[0], mask) for _, images, mask in pictures])

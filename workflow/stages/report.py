@@ -64,7 +64,7 @@ WIDTH, HERO_WIDTH, PAIR_WIDTH = 448, 768, 288
 """Longest side of a picture: of maps, of the first one, and of the pairs of all views. With six views and photographs as noisy
 as those of a phone the page stays below 15 MB."""
 PAIRS = 60
-"""Photographs that are shown beside their re-rendering; of more, so many are taken evenly."""
+"""Largest number of photographs that are shown next to their re-rendering; of more, this many are taken evenly."""
 
 
 NUMERICS = ("base", "emission", "shading", "affines")
@@ -316,7 +316,7 @@ def _prior_fact(prior: dict[str, Any]) -> str:
 
 
 def _objects_fact(job: Job, count: int) -> str:
-    """Return number, source and stability of the objects in words (docs/guide/segmentation.md)."""
+    """Describe number, source and stability of the objects (docs/guide/segmentation.md)."""
     facts = _document(job, "segmentation", "segmentation.json")
     if not facts:
         return str(count)
@@ -451,7 +451,7 @@ def _pair(job: Job, capture: CaptureReader, view: View, scores: dict[str, float]
 
 
 def _photograph(job: Job, capture: CaptureReader, view: View, longest: int) -> tuple[np.ndarray, Picture, Picture]:
-    """Return the photograph in sensor values (H, W, 3), its picture, and that of the re-rendering."""
+    """Return the photograph in sensor values (H, W, 3), its picture, and the picture of the re-rendering."""
     photo, _ = capture.photo(view, held_out=True)
     rendered = rgb(job.read("render").exr(f"maps/{view.name}.exr"), "ldr")
     kind, unit = ("srgb", "exposed radiance") if capture.is_hdr else ("sensor", "sensor value")

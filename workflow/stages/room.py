@@ -141,7 +141,7 @@ def _fitting(
 
 
 def _photograph(capture: CaptureReader, view: Any) -> np.ndarray:
-    """(H, W, 3) uint8: sensor values as they are, or radiance at an exposure of its own."""
+    """(H, W, 3) uint8: sensor values as they are, or radiance at its own exposure."""
     image, valid = capture.photo(view, held_out=True)
     return pictures.linear(image, color.key_exposure(image, valid)) if capture.is_hdr else pictures.encoded(image)
 
@@ -152,7 +152,7 @@ def _about(job: Job) -> list[str]:
         "Materials and lamps were recovered from photographs. The light of each lamp was traced once, with all reflections"
         f" ({samples} paths for each texel), and stored; the page adds the lamps up, so that strengths and colours are exact for"
         " diffuse light.",
-        "Intervals are those of the fit (95 %); that of albedo is that of its brightness.",
+        "Intervals are 95 % intervals of the fit; the interval of albedo is for its brightness.",
     ]
 
 

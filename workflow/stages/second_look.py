@@ -47,7 +47,7 @@ class _Predictions:
         self._first = StoredPredictions(job.read("prior")) if len(pool) > 1 else None
         seed = job.seed if own.seed is None else own.seed
         views = capture.used
-        # What the network needs of the views goes to a file of its own, which ends with the network.
+        # A scratch file holds what the network needs of the views; it is deleted when the network ends.
         gathered = Scratch(job.writer.directory)
         settings = member_settings(job.settings, own)
         predict = learned.prepare(

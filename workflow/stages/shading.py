@@ -169,9 +169,9 @@ def _views(
     diffuse: DiffuseShading,
     drawn: FitPixels | None,
 ) -> int:
-    """Write the specular light of the pixels that are `drawn`, None = of all, and the diffuse light of the cells, averaged with
-    that of the own paths of these pixels (Eq. S.19). Nothing is traced for held-out views, and without a `world` for none.
-    Returns the number of pixels that were traced."""
+    """Write the specular light of the pixels that are `drawn` (None = all), and the diffuse light of the cells. The latter is
+    averaged with the diffuse light that the pixels' own paths find (Eq. S.19). Nothing is traced for held-out views, and nothing
+    at all without a `world`. Returns the number of pixels that were traced."""
     count = 0
     for done, view in enumerate(capture.views):
         job.progress(done, len(capture.views), "views cached")

@@ -27,7 +27,7 @@ STATES = {
     "running": "a job of it runs",
     "waiting": "not begun, or between two jobs",
     "failed": "its last job ended with an error",
-    "killed": "its last job was started, did not end, and its process is gone",
+    "killed": "its last job started but did not end, and its process no longer exists",
     "refused": "its settings or data cannot be used; no job will be started",
     "stale": "made under other settings or other code; the next run makes it again",
     "unknown": "what is there cannot be read",
@@ -38,7 +38,7 @@ mistakes; all that are not done, for what they will take. The others count like 
 TAIL = 4096
 """Bytes at the end of a log in which its last line is looked for."""
 BESIDE = ("workflow.status", "workflow.rules", "workflow.profiles")
-"""Folders beside the infrastructure in which nothing is that results depend on."""
+"""Folders, in addition to the infrastructure, that hold nothing that results depend on."""
 
 
 @dataclass(frozen=True)
@@ -251,8 +251,8 @@ def _is_current(document: dict[str, Any], touched: float, scene: str, quality: s
 
 
 def _changed(scene: str) -> str:
-    """Return the name of a file of a deliverable that is gone or has another size or time stamp than when it was published; empty
-    if there is none, or if the deliverable is a copy, whose time stamps say nothing."""
+    """Return the name of a file of a deliverable that is missing, or whose size or time stamp changed since it was published;
+    empty if there is none, or if the deliverable is a copy, whose time stamps say nothing."""
     noted_of = stamps.load(stamps.place(Path("results"), scene, stamps.DELIVERABLE))
     if noted_of is None or not _is_original(scene):
         return ""
@@ -271,7 +271,7 @@ def _is_original(scene: str) -> bool:
 
 @lru_cache(None)
 def _code_changed() -> float:
-    """Return when a file on which results depend was last changed; that of the inode cannot be set back."""
+    """Return when a file on which results depend was last changed. The inode's time counts too, because it cannot be set back."""
     newest = 0.0
     for package in fp.PACKAGES:
         top = fp.REPOSITORY / package
@@ -304,8 +304,8 @@ def _source_is_there(scene: str, quality: str) -> None:
 
 
 def _jobs(scene: str, now: float) -> dict[str, Noted]:
-    """Return the states of the jobs of a scene that run or have not ended well; of a stage that several jobs make, that of one
-    that runs, if any does."""
+    """Return the states of the jobs of a scene that run or have not ended well. If several jobs make a stage, a running one
+    stands for it."""
     found: dict[str, Noted] = {}
     for stage, name in _files(scene, "logs", ".state.json"):
         job = noted(Path(f"results/{scene}/logs/{name}"), now)
@@ -387,6 +387,6 @@ def _touched(path: str) -> float | None:
 
 
 def quality_of(scene: str, quality: str) -> str:
-    """Return the quality of a scene in a run of `quality`: variants of `bench` have that of their point."""
+    """Return the quality of a scene in a run of `quality`: variants of `bench` have the quality of their point."""
     parts = study_files.derived(scene)
     return parts.variant if parts and parts.study == study_files.BENCH else quality

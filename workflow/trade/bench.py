@@ -79,8 +79,8 @@ def write_bench(scene: str, cores: int = 2) -> None:
     lines += ["", *(f"{HEADS[name]}: {words}." for name, words in WORDS.items())]
     lines += [
         "",
-        f"This machine takes {factor:.2f} times as long as that of the shipped costs. Seconds are those of the stages after",
+        f"This machine takes {factor:.2f} times as long as the machine of the shipped costs. Seconds are of the stages after",
     ]
-    lines += ["`capture` up to `metrics`; the expected ones are of all stages, and count the start of the jobs, too.", ""]
+    lines += ["`capture` up to `metrics`; the expected ones are of all stages and include the start of the jobs.", ""]
     write_atomically(folder / "bench.md", lambda path: path.write_text("\n".join(lines)))
     print("\n".join(lines))

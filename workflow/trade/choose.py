@@ -27,9 +27,9 @@ OTHERS = ("events", "inputs", "maps", "colour")
 
 
 LABORATORY = "with simulated predictions and given objects (from photographs alone, expect several dB less)"
-"""How the points were measured: told beside every number that comes from them."""
+"""How the points were measured. It stands next to every number that comes from them."""
 MOST_SCENES = 5
-"""As many scenes are told one by one how they differ from a quality."""
+"""Largest number of scenes that are listed one by one with what differs from the quality."""
 
 
 class Request(NamedTuple):
@@ -37,7 +37,7 @@ class Request(NamedTuple):
 
     Attributes:
         key, value: as given.
-        quality: the quality by name; where it is to be chosen for each scene, that of what is no scene of its own.
+        quality: the quality by name. If each scene is to choose its own, this is the quality of all that is not a scene.
         cores: that Snakemake may use.
     """
 
@@ -48,7 +48,7 @@ class Request(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """The quality of a scene, and what a person is told about it."""
+    """The quality of a scene, and the line that explains it to a person."""
 
     quality: str
     line: str = ""
@@ -94,10 +94,10 @@ def read(config: Mapping[str, Any], given: Collection[str], cores: int | None) -
 
 
 def choice(request: Request, scene: str) -> Choice:
-    """Return the quality of a scene. Variants of studies keep theirs, those of `bench` that of their point.
+    """Return the quality of a scene. Variants of studies keep theirs; variants of `bench` have the quality of their point.
 
     A choice that was made before is kept as long as request, points and settings are what they were (`keep`), although by now the
-    machine is known better: a run that was interrupted goes on, and a finished one is not made again.
+    machine is known better: an interrupted run continues, and a finished one is not repeated.
 
     Raises:
         InputError: settings of the scene that cannot be used, a budget that no point keeps to, a target that none reaches.
@@ -131,7 +131,7 @@ def _file(scene: str) -> Path:
 
 
 def _marks(request: Request, scene: str, quality: str) -> dict[str, str]:
-    """What a choice depends on, beside the speed of the machine."""
+    """What a choice depends on, in addition to the speed of the machine."""
     table = hashlib.sha256(SHIPPED.read_bytes()).hexdigest()[:16]
     settings = hashlib.sha256(fingerprints.resolved(scene, quality).encode()).hexdigest()[:16]
     return {"request": f"{request.key}={request.value}", "points": table, "settings": settings}

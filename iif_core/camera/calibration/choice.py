@@ -30,7 +30,7 @@ GAUGE = (
 _SIGNIFICANT = 2.0  # standard errors
 _MIN_ROWS = 200  # to fit a curve
 _SIGMA = 1.0  # standard deviation of a parameter around its start
-_CHANNEL_SIGMA = 0.05  # standard deviation of a parameter of one channel around that of all channels
+_CHANNEL_SIGMA = 0.05  # standard deviation of a parameter of one channel around its value in the common curve
 
 
 @dataclass(frozen=True)
@@ -58,14 +58,14 @@ class CalibratedResponse:
 
     Attributes:
         response: chosen curve, (3, P); the start if the data are insufficient.
-        covariance: (3 P, 3 P) of its parameters; that of the prior if the data are insufficient.
+        covariance: (3 P, 3 P) of its parameters; the prior's covariance if the data are insufficient.
         stops: largest difference of exposure within a patch, in stops.
         rows: (patch, view, channel) rows used.
         before, after: robust spread of log radiance within patches with the starting curve and with the chosen one.
         candidates: {family, parameters, score, behind, error} each; `behind` is the distance to the best score.
-        reason: the choice in words.
+        reason: why this curve was chosen, as text.
         exposure: (V,) of the views, given or estimated (mean over the channels).
-        gauge: what cannot be determined, in words; empty with given exposures.
+        gauge: what cannot be determined, as text; empty with given exposures.
         gains: exposure, white balance and vignetting estimated with the curve; None where exposures are given.
     """
 

@@ -71,7 +71,7 @@ class PixelRows:
     def radiance(self, response: Response) -> tuple[np.ndarray, np.ndarray]:
         """Return observed radiance y = f^-1(I) / e and squared slope w^2 = (e f'(e y))^2 of the sensor there, (n, 3) each.
 
-        For `identity` (HDR) the loss is that of FIPT, measured through the sRGB curve, which is continued as a power above 1.
+        For `identity` (HDR) this gives FIPT's loss: it is measured through the sRGB curve, continued above 1 as a power.
         """
         if response.family == "identity":
             y = np.maximum(self.value.astype(np.float64), 0.0)

@@ -1,6 +1,6 @@
 """Compiled loss of a batch and its gradient in closed form (Eqs. F.1 to F.15 and F.50 to F.54).
 
-A batch is sorted by segment; a tile is up to `TILE` pixels of one segment. The real type is that of the raw outputs: float32 to
+A batch is sorted by segment; a tile is up to `TILE` pixels of one segment. The raw outputs set the real type: float32 to
 solve, float64 to check. One thread makes the sums of a segment, so the bytes do not depend on the number of threads.
 """
 

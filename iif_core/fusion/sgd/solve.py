@@ -110,7 +110,7 @@ def solve_sgd(
 ) -> SgdFit:
     """Solve a problem by the paper's optimiser.
 
-    A descent that was interrupted goes on from the end of any epoch, to the same bytes.
+    An interrupted descent continues from the end of any epoch and gives the same bytes.
 
     Args:
         problem: predictions on cells, with surface points for a hash grid.

@@ -78,7 +78,7 @@ class VoxelPixels:
         return cls(float(edge), np.asarray(origin, np.float32), keys, voxel.astype(np.int32), radiance, censored)
 
     def cache(self, use: np.ndarray) -> RadianceVoxels:
-        """Return the cache of the pixels `use`, (n,) bool: to the last bit that of `RadianceSums` with them in their order."""
+        """Return the cache of the pixels `use`, (n,) bool: bit for bit what `RadianceSums` gives for them in their order."""
         size = len(self.keys)
         plain, clipped = np.flatnonzero(use & ~self.censored), np.flatnonzero(use & self.censored)
         voxel = self.voxel[plain]

@@ -124,7 +124,7 @@ def with_thin_objects(
 ) -> FaceStatistics:
     """Take the statistics of interior pixels, and those of all pixels for objects too thin to have interior ones.
 
-    Pixels at the border of an object mix with what is beside it. An object without interior pixels (a filament) is judged by
+    Pixels at the border of an object mix it with its surroundings. An object without interior pixels (a filament) is judged by
     all of its pixels if nine tenths of them are bright, which excludes the frame of a window.
 
     Args:
@@ -187,8 +187,8 @@ def glowing_pieces(
     """Find connected surface of one object that is much brighter than the room as a whole (Eq. L.4), in all views alike.
 
     Curtains, blinds and shades with light behind them transmit it unevenly, so that few of their faces are bright all over.
-    A piece counts when the median over its pixels of the mean radiance of the face that they see is `GLOW_RATIO` times that of
-    all pixels. What a mirror shows depends on where the camera stands.
+    Each pixel stands for the mean radiance of the face that it sees. A piece counts when the median over its pixels is at least
+    `GLOW_RATIO` times the median over all pixels. What a mirror shows depends on where the camera stands.
 
     Args:
         statistics: of F faces; adjacency: (E, 2) pairs of neighbouring faces; object_id: (F,), -1 = none.

@@ -40,7 +40,7 @@ class EmissionSolution:
         error: (G, 3) standard error (Eq. L.29 without the level).
         determined: (G,) in [0, 1]: share of the answer that comes from data rather than from the initial value.
         condition: largest / smallest eigenvalue of the lifted normal matrix at unit diagonal, of the worst channel.
-        residual: weighted root mean square of target - A E, relative to that of the target.
+        residual: weighted root mean square of target - A E, relative to the root mean square of the target.
         violated: number of lower bounds that the answer does not reach.
         iterations: rounds of re-weighting.
         converged: the answer came to rest.
@@ -453,7 +453,7 @@ class _ChannelRows:
         return out
 
     def _design_effect(self, answer: np.ndarray, variance: np.ndarray) -> np.ndarray:
-        """(G,) >= 1, variance of the answer relative to that of rows with independent errors (Kish 1965; Eq. L.28)."""
+        """(G,) >= 1, variance of the answer relative to its variance if the rows erred independently (Kish 1965; Eq. L.28)."""
         effect = np.ones(len(answer))
         system = self.system(self.sure, np.zeros(len(self.target)), variance)
         if system is not None:

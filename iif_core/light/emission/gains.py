@@ -19,7 +19,7 @@ _COLOUR_STEPS = 4
 BASE_COLOUR_ERROR = 0.1
 """Standard deviation of the logarithm of a channel of the mean base albedo, relative to the mean over the channels."""
 SHARED_COLOUR_ERROR = 0.02
-"""Systematic error of the logarithm of the level of a channel, relative to that of all channels, common to all objects."""
+"""Systematic error of the logarithm of a channel's level relative to the level of all channels. All objects share this error."""
 LARGEST_COLOUR_ERROR = 0.5
 """The logarithm of a channel of the light relative to the mean over the channels is taken to be known at least so well."""
 LOG_LEVELS = np.linspace(-2.0, 2.0, 161)
@@ -105,7 +105,7 @@ def estimate_object_gains(
         rows: the system; without lobes there is one factor for everything that an object reflects.
         owner: (n,) object of each row, -1 = not reflected light (a pixel on an emitter).
         prior: of the groups.
-        scale_is_identifiable: the light has a scale of its own; otherwise the mean of log g over the rows stays 0.
+        scale_is_identifiable: the light has its own scale; otherwise the mean of log g over the rows stays 0.
         albedo: of the base; None = nothing is known of it.
         n_objects: gains for at least so many objects; an object without rows gets the common gain.
         options: None = defaults.
@@ -233,8 +233,10 @@ class _Level(NamedTuple):
 
 
 def _find_level(moments: _Moments, owner: np.ndarray, albedo: BaseAlbedo | None) -> _Level:
-    """Find the level of least cost, its colour weighed against that of the base, and raised in all channels alike until albedos
-    are at most 1 (Eq. L.47), or not at all if no level makes them possible. owner (n,): object of each row, the last = anchors.
+    """Find the level of least cost, with its colour weighed against the colour of the base.
+
+    With limited albedos, all channels of the level are then raised alike until albedos are at most 1 (Eq. L.47). They are not
+    raised at all if no level achieves that. owner (n,): object of each row, the last = anchors.
     """
     costs = moments.costs()
     best, objects = _lowest(costs.sum(1)), moments.objects
@@ -257,8 +259,8 @@ def _colour_shift(moments: _Moments, level: np.ndarray, base: np.ndarray, rows: 
     """(3,) by which log s of each channel changes, relative to the mean over channels, if the colour of the light, of standard
     error `error` (3,), is weighed against the mean colour of the base albedos (O, 3) of objects of so many `rows` (O,).
 
-    Where part of the light is given, the colour of the albedos follows that of the rest by a share q below 1. The shift d has the
-    least (d / error)^2 + ((c - q d) / BASE_COLOUR_ERROR)^2, c being the cast of the albedos without it.
+    Where part of the light is given, the colour of the albedos follows the colour of the remaining light only by a share q < 1.
+    The shift d minimises (d / error)^2 + ((c - q d) / BASE_COLOUR_ERROR)^2, where c is the cast of the albedos without the shift.
     """
 
     def cast(shift: np.ndarray | float) -> np.ndarray:
@@ -292,7 +294,7 @@ def _by_object(values: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _ObjectRows:
-    """The rows by object: `column` (n,) is the object, count - 1 that of the anchors, whose gains are 1."""
+    """The rows by object: `column` (n,) is the object. Column count - 1 holds the anchors, whose gains are 1."""
 
     rows: EmissionRows
     column: np.ndarray
@@ -303,7 +305,7 @@ class _ObjectRows:
     def moments(
         self, weight: np.ndarray, gloss_weight: np.ndarray, radiance: np.ndarray, known: np.ndarray | None = None
     ) -> _Moments:
-        """Sums for the light `radiance` (G, 3) at any level, beside light `known` (G, 3) whose level is known; weight (n, 3)."""
+        """Sums for the light `radiance` (G, 3) at any level, plus light `known` (G, 3) at a known level; weight (n, 3)."""
 
         def lobe(number: int) -> tuple[_Traces, _Traces]:
             """Light at level 1, and light that does not follow the level."""

@@ -21,8 +21,8 @@ def with_hidden_surface(
 ) -> EmitterGroups:
     """Append objects that no camera sees, one group each.
 
-    A lamp is mostly an object of its own. Unseen parts of objects that are seen, and do not shine there, would explain light that
-    the model lacks for other reasons.
+    A lamp is usually a separate object. The unseen parts of an object that cameras see are therefore left out: they would explain
+    light that the model lacks for other reasons.
 
     Only what lights the surface that cameras see matters, so that objects which few rays from there meet are left out.
 

@@ -8,7 +8,7 @@ from iif_core.light.emission.rows import EmissionRows
 
 
 def reference_loss(rows: EmissionRows, radiance: np.ndarray, cross: bool = True) -> float:
-    """Return the mean over rows and channels of w r^2 relative to that of w t^2 (Eq. L.48).
+    """Return the mean of w r^2 over rows and channels, relative to the mean of w t^2 (Eq. L.48).
 
     With `cross` the square is the product of the residuals of the two traces, whose noise is independent, so that an answer that
     is shrunk to reduce the noise is not favoured; the loss can then be slightly negative. A bound counts only where the mean

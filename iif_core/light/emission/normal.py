@@ -67,7 +67,7 @@ def normal_system(
         normal: sums over the rows.
         width: (G,) standard deviation of the prior; infinity switches it off.
         variance: (G,) of a row of weight 1, which weighs the prior.
-        ridge: added to the diagonal, relative to that of M.
+        ridge: added to the diagonal, relative to the diagonal of M.
         correlation: (G, G) of the prior, positive definite; None = none.
 
     Returns:

@@ -9,7 +9,7 @@ import numpy as np
 TILE_PIXELS = 8
 """Pixels of one object in one tile of this edge are averaged into one row, or in a larger one of PIXELS_PER_TILE."""
 PIXELS_PER_TILE = 2.4
-"""Pixels that are traced for each tile, or more: the noise of a row is that of their mean, however large a photograph is."""
+"""Pixels that are traced for each tile, or more. The noise of a row is the noise of their mean, however large a photograph is."""
 FULL_COVERAGE = 0.95
 """Share of a pixel from which an emitter counts as filling it."""
 COVERAGE_ERROR = 0.05

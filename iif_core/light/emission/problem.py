@@ -82,7 +82,7 @@ class EmissionProblem:
     ) -> tuple[EmissionProblem, ObjectGains]:
         """Estimate the albedo gains of objects together with the light (up to 15 solves; docs/method/light.md#object-gains).
 
-        `prior` is that of the groups, `albedo` of the base, if known; options: None = defaults.
+        `prior` is the prior of the groups, `albedo` the albedo of the base, if known; options: None = defaults.
         Returns the problem with rows scaled by the gains, without lobes, and weights relative to what the rows should show; and
         the gains.
         """

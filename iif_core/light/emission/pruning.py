@@ -19,8 +19,8 @@ CERTAIN_EXCESS_OPEN = 8.0
 """The same where much of the light comes through large openings of the mesh: surface below a lamp that no camera sees is much
 brighter than a white surface under the mean light."""
 POSSIBLE_EXCESS = 1.0
-"""The same from which a group that was dropped may shine after all: its light may have been taken for that of others, and of
-saturated surface only a bound of its brightness was seen."""
+"""The same from which a dropped group may shine after all: its light may have been attributed to other groups, and saturated
+surface shows only a bound of its brightness."""
 MAX_RESIDUAL_GROWTH = 0.03
 """Growth of the residual from which the scene needs a group; with albedos that are only predicted, one more free column always
 explains something."""

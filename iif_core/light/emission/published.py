@@ -125,7 +125,7 @@ def descend(
     """Descend from a state to the end of the schedule; yields the state after every step.
 
     Args:
-        state: where to begin; a descent that was interrupted goes on from any state that was yielded, to the same end.
+        state: where to begin. An interrupted descent continues from any yielded state and ends with the same result.
         pixels: number of pixels that can be drawn.
         trace: (pixels (n,), state, step) -> fresh paths of these pixels, to the emitters that the state keeps.
         loss: (pixels (n,), radiance (n, 3)) -> loss and its derivative by the radiance.

@@ -84,7 +84,7 @@ class Candidates:
         """
         misfit, lit, _ = self._look(chosen)
         found: dict[Families, float] = {}
-        largest: dict[Families, tuple[float, float]] = {}  # growth of the misfit, in this look and in a trace of its own
+        largest: dict[Families, tuple[float, float]] = {}  # growth of the misfit, in this look and in a separate trace
         always: set[Families] = set()
 
         def with_added(families: Families, value: float, lit: EmissionProblem, most: int) -> None:
@@ -200,7 +200,7 @@ def search(
     Args:
         chosen: families to begin with.
         proposals: sets of families that look better than a given one, best first.
-        misfit: of a set of families, from a trace of its own.
+        misfit: of a set of families, from a separate trace.
 
     Returns:
         The families, and for each change: the families after it, and the misfit before and after.

@@ -47,7 +47,7 @@ def solve_emission_sgd(rows: EmissionRows, initial: np.ndarray, options: SgdOpti
 
     Returns:
         The solution; `error` and `determined` are 0, since there is no covariance; `converged` is False when the descent left
-        the finite numbers (the radiance is then that of the step before) or ended worse than it began.
+        the finite numbers (the radiance then comes from the step before) or ended worse than it began.
 
     Raises:
         InputError: `initial` of the wrong shape.
@@ -103,7 +103,7 @@ def solve_emission_sgd(rows: EmissionRows, initial: np.ndarray, options: SgdOpti
 
 
 def _misfit(rows: EmissionRows, radiance: np.ndarray) -> tuple[float, float, int]:
-    """Weighted sum of squares, that of the target, and number of bounds that are not reached."""
+    """Weighted sums of squares of the residual and of the target, and number of bounds that are not reached."""
     target = rows.mean_target
     difference = target - np.einsum("ngc,gc->nc", rows.matrices.mean(0), radiance)
     counted = np.where(rows.lower_bound & (difference < 0), 0.0, rows.weight)

@@ -35,8 +35,8 @@ def chunks(count: int, size: int) -> Iterator[slice]:
 def on_device(values: ArrayLike, kind: Any = None) -> Any:
     """Flat device array of type `kind` (None = Float) with the values, row-major.
 
-    Dr.Jit takes the memory of a NumPy array as it is, and kernels depend on whether it is aligned: without this copy every call
-    would compile a kernel of its own (docs/development/architecture.md#compiled-kernels).
+    Dr.Jit uses the memory of a NumPy array as it is, and kernels depend on whether that memory is aligned. Without this copy,
+    every call would compile its own kernel (docs/development/architecture.md#compiled-kernels).
     """
     kind, values = mi.Float if kind is None else kind, np.asarray(values)
     size = 4 * values.size

@@ -59,7 +59,7 @@ class RadianceCache:
     """Diffuse outgoing radiance on a voxel grid, with which a path ends instead of bouncing on
     (docs/method/light.md#radiance-cache).
 
-    A voxel in the table with radiance 0 is a black surface; a voxel that is not in the table is unknown, and the path goes on
+    A voxel in the table with radiance 0 is a black surface. A voxel that is not in the table is unknown, and the path continues
     (docs/method/numerics.md#empty-voxels-of-the-radiance-cache).
 
     Args:

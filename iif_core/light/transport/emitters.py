@@ -25,7 +25,7 @@ REMAINDER_STEP = 1 / 16
 more or less moves those of all faces after it."""
 
 SHARE_LIMITS = (0.1, 0.5)
-"""Bounds of the environment's share of the draws beside emitting faces, so that a wrong guess of its power starves neither."""
+"""Bounds of the environment's share of the draws, next to emitting faces: a wrong guess of its power then starves neither."""
 
 
 class Emitters:
@@ -160,7 +160,9 @@ class Emitters:
 
 
 def share_of_environment(geometry: Geometry, power: float, sky: float) -> float:
-    """Choose the share of draws for the environment beside emitting faces, by the light that each gives to surfaces (Eq. L.11).
+    """Divide the draws between the environment and the emitting faces; return the environment's share (Eq. L.11).
+
+    The shares follow the light that each gives to surfaces.
 
     power: sum of area x mean radiance of the faces; sky: mean radiance over all directions. Clipped to SHARE_LIMITS.
     """

@@ -38,7 +38,7 @@ class LampCollector:
         return self.add(self.environment_lamp, weight * radiance, active)
 
     def add(self, lamp: Any, value: Any, active: Any) -> Any:
-        """Add the radiance `value` (Color3f) to that of `lamp` in the row of the lane; return what the path gains, 0."""
+        """Add `value` (Color3f) to the radiance of `lamp` in the row of the lane; return what the path gains, 0."""
         entry = (self.lane * self.lamps + lamp) * 3
         for channel in range(3):
             mode = dr.ReduceMode.NoConflicts

@@ -34,7 +34,7 @@ Array = np.ndarray
 DRAWS = 2
 """Emitters that are drawn at a point of the map for each direction."""
 CELLS = 1 << 14
-"""Squares of which the surface would consist if it were cut evenly; their edge is that of the voxels of known light."""
+"""Squares of which the surface would consist if it were cut evenly. The voxels of known light have the same edge."""
 LEARNED = 0.5
 """Rays for each point of a map that find the surface from which it gets reflected light."""
 
@@ -114,8 +114,10 @@ def _arriving(
 def _reflected(
     world: World, known: LampCache, rng: Any, origin: Any, direction: Any, max_bounces: Any, active: Any
 ) -> tuple[Any, Any]:
-    """Collect what the surface that a ray meets reflects: of known light if there is some, and its gloss, or all of a path, from
-    the path that goes on. Returns the gain, 0, and the random stream."""
+    """Collect what the surface that a ray meets reflects; return the gain, 0, and the random stream.
+
+    Where the diffuse light of the surface is known, it is looked up, and the path continues for the gloss alone. Elsewhere the
+    path continues for all of the light."""
     # -------- the surface that the ray meets --------
     hit = nearest_hit(world.geometry, origin, direction, active, world.geometry.draw_salt(rng))
     front = -dr.dot(hit.normal, direction)
@@ -217,14 +219,14 @@ def known_light(
 ) -> LampCache | None:
     """Trace the light of the surface that reflects it to the points of a light map, for `light_maps`.
 
-    It is traced where rays from some of the points meet surface, and averaged over cells. Each part of a cell so counts as often
-    as it is met, and the mean over all points of what they get from a cell is that of the paths.
+    The light is traced where rays from some of the points meet surface, and averaged over cells. Each part of a cell thus counts
+    as often as it is met. What all points get from a cell therefore has the same mean as with whole paths.
 
     Args:
         scene, lamp_of_face, lamps, environment_lamp: as in `light_maps`.
         points, normals: (n, 3) of the map: metres; unit vectors on the side from which light arrives.
         object_of_face: (m,) object of every face, -1 = none.
-        paths: from each place; bounces include the place, and their seed is another than that of the map.
+        paths: from each place; bounces include the place, and the seed differs from the seed of the map.
 
     Returns:
         The light; None where no surface is met or paths have no bounce.

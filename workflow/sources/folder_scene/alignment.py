@@ -30,7 +30,7 @@ CLEARLY_OWN = 2.0
 """Standard errors by which photographs must fit the mesh better from their own pose than from those of others."""
 COMPARED_VIEWS = 64  # at most so many photographs are compared with the mesh as the others see it
 CLEAR_CORRELATION = 0.12
-"""Another convention is proposed if it reaches this correlation and three times that of the convention in use."""
+"""Another convention is proposed if its correlation reaches this and three times the correlation of the convention in use."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Conventions:
         return opencv_pose(matrix, self.axes, self.metres)
 
     def depth_pose(self, frame: Frame) -> np.ndarray:
-        """Return `world_from_camera` of the depth image, which may have a pose of its own."""
+        """Return `world_from_camera` of the depth image, which may have its own pose."""
         if frame.depth_matrix is None:
             return self.pose(frame)
         matrix = self.change(frame.depth_matrix) if self.change and self.of_world else frame.depth_matrix
@@ -75,7 +75,7 @@ class Conventions:
 def depth_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_depth: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Compare the depth of the mesh with a depth image.
 
-    The depth image is converted to points that are looked up in `mesh_depth`, so that a depth camera beside the colour camera is
+    The depth image is converted to points, which are looked up in `mesh_depth`. A depth camera next to the colour camera is thus
     compared correctly, except at surface that only one of the two sees.
 
     Args:
@@ -107,7 +107,7 @@ def depth_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_dept
 
 
 def point_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_depth: np.ndarray) -> np.ndarray:
-    """Compare the depth of the mesh with that of the sparse points that the photograph sees.
+    """Compare the depth of the mesh with the depth of the sparse points that the photograph sees.
 
     Args:
         frame: the photograph and its points.
@@ -191,7 +191,7 @@ def explain(
         tolerance: largest acceptable disagreement.
 
     Returns:
-        Advice in words; empty if no convention fits.
+        Advice as text; empty if no convention fits.
     """
     chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, TRIAL_VIEWS).astype(int))]
     depths = [images.load_depth(frame.depth, depth_unit) if frame.depth else None for frame, _ in chosen]
@@ -237,7 +237,7 @@ def explain_edges(
         now: correlation with the convention in use.
 
     Returns:
-        Advice in words; empty if no convention is clearly better.
+        Advice as text; empty if no convention is clearly better.
     """
 
     def correlation(tried: Conventions) -> float:
@@ -356,7 +356,7 @@ def _standardised(pictures: np.ndarray) -> np.ndarray:
 
 @dataclass
 class Alignment:
-    """Collects the comparisons of all views: `report` for capture.json, `notes` and `edge_warning` in words, `refuse`.
+    """Collects the comparisons of all views: `report` for capture.json, `notes` and `edge_warning` as text, `refuse`.
 
     Attributes:
         ratios: of depth; edges: correlations (2 SHIFT + 1, 2 SHIFT + 1), both by view.
@@ -411,7 +411,7 @@ class Alignment:
         return [name for name, ratio in self.ratios.items() if disagreement(ratio) > tolerance]
 
     def notes(self, tolerance: float) -> list[str]:
-        """Return the numbers in words."""
+        """Return the numbers as text."""
         r, out = self.report(), []
         wrong = self.disagreeing_views(tolerance) if "depth_median_disagreement" in r else []
         if wrong:

@@ -136,7 +136,7 @@ def _exr(path: Path) -> dict[str, np.ndarray]:
 
 
 def _colours(path: Path, channels: dict[str, np.ndarray]) -> list[str]:
-    """Return the names of R G B [A], or three times that of one grey channel [and A]."""
+    """Return the names of R G B [A], or three times the name of one grey channel [and A]."""
     if all(c in channels for c in "RGB"):
         names = list("RGB")
     else:

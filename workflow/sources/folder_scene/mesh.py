@@ -23,7 +23,7 @@ SUFFIXES = (".ply", ".obj", ".glb")
 MIN_AREA = 1e-12  # m^2; smaller triangles are removed (docs/method/numerics.md#degenerate-faces)
 DIAGONAL = (0.5, 200.0)  # metres; a room outside of this range is in another unit (docs/method/numerics.md#unit-of-the-mesh)
 FACTORS = (0.1, 0.01, 0.001)
-"""Factors on camera positions far away that are tried: decimetres, centimetres and millimetres beside metres."""
+"""Factors on camera positions far away that are tried: decimetres, centimetres and millimetres, in addition to metres."""
 LEAST_SPREAD = 0.05  # of the scene's size; cameras nearer to one another lie in the mesh by any small factor
 TURNS = {
     "as_poses": np.eye(3),
@@ -47,7 +47,7 @@ class Mesh:
         instance: (m,) int32 object of each face with -1 = none, or None.
         names: of the objects.
         from_nodes: whether the objects are the nodes of the file rather than given ids.
-        notes: what was removed, in words.
+        notes: what was removed, as text.
     """
 
     vertices: np.ndarray
@@ -307,7 +307,7 @@ def check_size(path: Path, mesh: Mesh, unit: str | float, metres: float, centres
 
 
 def _factor_advice(bounds: np.ndarray, centres: np.ndarray) -> str:
-    """Return in words what is between mesh and poses; names the power of ten that brings nine of ten cameras into the mesh."""
+    """Describe how mesh and poses differ, with the power of ten that brings nine of ten cameras into the mesh, if one does."""
     for factor in FACTORS:
         scaled = centres * factor
         spread = np.linalg.norm(np.ptp(scaled, axis=0)) > LEAST_SPREAD * np.linalg.norm(bounds[1] - bounds[0])

@@ -29,7 +29,7 @@ class Registered:
         poses: (4, 4) `world_from_camera` of each frame.
         left_out: name of a frame -> why it should not be used.
         facts: numbers for capture.json.
-        notes: the same in words.
+        notes: the same as text.
         plan: entries of plan.yaml.
     """
 

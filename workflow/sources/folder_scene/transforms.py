@@ -88,7 +88,7 @@ class Transforms:
         depth_unit: metres per value of the depth images, where the file states it.
         axes: camera axes of the frames' matrices, `opengl` or `opencv`.
         known: whether the format of the file determines the axes, so that no setting can be wrong.
-        notes: what was left out, in words.
+        notes: what was left out, as text.
         also: further files that were read.
     """
 
@@ -193,7 +193,7 @@ def frames_of(
             `_mask_full`, `_split`, `_seen` fill the fields of Frame.
         root: folder that `file_path` counts from.
         source, capture: the dumped settings sections.
-        world: (4, 4) rotation, translation and uniform scale from the world of the poses to that of the mesh; None = identity.
+        world: (4, 4) rotation, translation and uniform scale from the world of the poses to the mesh's; None = identity.
 
     Returns:
         The checked frames.

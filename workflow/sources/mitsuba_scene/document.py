@@ -15,7 +15,7 @@ from workflow.settings.names import did_you_mean_path
 
 WHERE_FROM = (
     "Scenes from outside lie under data/ (a symbolic link is fine); the shipped ones are Benedikt Bitterli's rendering"
-    " resources in Mitsuba form, with meshes/ and textures/ beside scene.xml"
+    " resources in Mitsuba form, with meshes/ and textures/ next to scene.xml"
 )
 _SHOWN = 8
 _DEEPEST = 16  # <include> levels
@@ -41,7 +41,7 @@ def referenced_files(xml: Path) -> list[Path]:
         more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
         raise InputError(
             f"{xml}: names {len(names)} file(s) that are not there: {', '.join(names[:_SHOWN])}{more}."
-            f" Looked in {xml.parent}. Put them beside the XML under these names. {WHERE_FROM}"
+            f" Looked in {xml.parent}. Put them next to the XML under these names. {WHERE_FROM}"
         )
     remedies = {"sensor": "add a <sensor> inside the room: the camera path starts there", "shape": "add surface"}
     for tag, remedy in remedies.items():

@@ -33,7 +33,7 @@ class FlatMesh:
         primitive: (m,) int32, face of the shape's own mesh; -1 where it was tessellated here.
         emission: (m, 3) float32 radiance of the front side.
         shapes: all shapes of the scene.
-        notes: what was left out, in words.
+        notes: what was left out, as text.
     """
 
     vertices: Array

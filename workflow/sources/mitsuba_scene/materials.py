@@ -114,7 +114,7 @@ class Material:
         transparent: transmits light (glass).
         two_sided: reflects on both sides.
         masked: has an opacity.
-        notes: approximations of the conversion, in words.
+        notes: approximations of the conversion, as text.
     """
 
     def __init__(self, bsdf: Any):

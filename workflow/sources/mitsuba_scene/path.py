@@ -138,7 +138,7 @@ def fibonacci_sphere(n: int) -> Array:
 
 
 def upright(direction: Array) -> Array:
-    """Return the signed coordinate axis nearest to a direction, such as the upward axis of a scene from that of its sensor."""
+    """Return the signed coordinate axis nearest to a direction, such as the upward axis of a scene from its sensor's."""
     axis = int(np.argmax(np.abs(direction)))
     return np.eye(3)[axis] * np.sign(direction[axis])
 
@@ -326,7 +326,7 @@ def _views(
     e1, e2 = _basis(up)
     packed, poses = [], []
     for index, position in enumerate(positions):
-        turn = 2 * np.pi * (0.6180339887498949 * index % 1) / YAWS  # gives every position yaws of its own
+        turn = 2 * np.pi * (0.6180339887498949 * index % 1) / YAWS  # gives every position its own yaws
         yaw, pitch = np.meshgrid(turn + 2 * np.pi * np.arange(YAWS) / YAWS, np.radians(PITCHES), indexing="ij")
         across = np.cos(yaw).reshape(-1, 1) * e1 + np.sin(yaw).reshape(-1, 1) * e2
         forward = np.cos(pitch).reshape(-1, 1) * across + np.sin(pitch).reshape(-1, 1) * up

@@ -73,7 +73,7 @@ def load(xml: Path) -> LoadedScene:
     """
     parser = mi.parser
     config = parser.ParserConfig(mi.variant())
-    config.merge_meshes = config.merge_equivalent = False  # every shape stays an object of its own, as the ids require
+    config.merge_meshes = config.merge_equivalent = False  # every shape stays its own object, as the ids require
     resolver = mi.file_resolver()
     before = [str(resolver[i]) for i in range(len(resolver))]
     resolver.prepend(str(xml.parent.resolve()))

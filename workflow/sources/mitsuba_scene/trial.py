@@ -1,4 +1,4 @@
-"""A scene file is loaded in a process of its own first: Mitsuba ends its process on some files, as on a bitmap without a file."""
+"""A separate process loads a scene file first: Mitsuba ends its process on some files, such as a bitmap without a file."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class Light:
         cover: what hangs before the windows: None, "curtains" or "blinds".
         panes: radiance of luminous panes in the window openings; None = openings.
         lamps: luminous things in the room: "ceiling", "bulb", "shade", "recess" (which no camera sees).
-        door: the room is lit through a door that is ajar, from a room beside it.
+        door: the room is lit from the next room, through a door that is ajar.
     """
 
     windows: int = 1

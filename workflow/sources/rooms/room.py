@@ -20,7 +20,7 @@ _STEP = np.array([0.8191725, 0.6710436, 0.5497005])  # generator of the R3 seque
 
 @dataclass(frozen=True)
 class Scan:
-    """The mesh of a room that is delivered beside its photographs.
+    """The mesh of a room that is delivered with its photographs.
 
     Attributes:
         vertices: (n, 3) float32 metres; faces: (m, 3) int32.
