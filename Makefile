@@ -13,7 +13,7 @@ CONFIG = $(if $(QUALITY),--config quality=$(QUALITY))
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup scenes status verify test test-all test-slurm fuzz node doctor lint format lock lock-torch licences sbom docs clean always plan relight bench compare score results \
-  config envs iif_core lab profiles tests workflow
+  config envs examples iif_core lab profiles tests workflow
 
 help:
 	@echo 'make scenes/<name>    install what is missing, then make the scene (config/scenes/<name>.yaml)'
@@ -70,7 +70,7 @@ results/%: setup always
 plan relight bench compare score results:
 	@echo '$@: not a target; name what is to be made in it, such as make $@/$(if $(filter plan relight bench score,$@),kitchen,$(if $(filter compare,$@),kitchen$(COMMA)hall,kitchen/capture/manifest.json))' >&2; exit 1
 
-config envs iif_core lab profiles tests workflow:
+config envs examples iif_core lab profiles tests workflow:
 	@echo '$@: a folder of the program and not a target; make help lists the targets' >&2; exit 1
 
 # Anything else; scene/x is taken for a slip of scenes/x.
