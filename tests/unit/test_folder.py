@@ -370,6 +370,7 @@ def test_distortion_is_removed(tmp_path, lens):
         assert np.median(error) < 0.004
         assert np.quantile(error, 0.95) < 0.03
     assert any("lens distortion" in n for n in capture.facts["notes"])
+    assert any("no exposures.json" in n and "exposure: estimate" in n for n in capture.facts["notes"])
 
 
 def test_hdr_exposure_nan_instances_and_truth(tmp_path):
@@ -403,6 +404,7 @@ def test_hdr_exposure_nan_instances_and_truth(tmp_path):
         np.testing.assert_array_equal(capture.given_instances(view), shots[i][3] // 12)
     assert not capture.photo(capture.views[0])[1][5, 6]
     assert "photographs: 1 NaN or infinite pixels are ignored" in capture.facts["notes"]
+    assert not any("no exposures.json" in note for note in capture.facts["notes"])
 
 
 def test_estimated_exposure(tmp_path):

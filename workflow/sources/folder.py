@@ -377,6 +377,11 @@ class _Capture:
         if self.inputs.gains is not None and self.settings.exposure == "given":
             return list(self.inputs.gains)
         if self.inputs.exposures is None:
+            if self.settings.exposure == "given" and len(frames) > 1:
+                self.notes.append(
+                    "no exposures.json: the photographs count as equally exposed; with automatic exposure, set"
+                    " `capture: {exposure: estimate}`"
+                )
             return [1.0] * len(frames)
         if self.settings.exposure == "estimate":
             self.notes.append("exposures.json is not used: `capture.exposure` is estimate")
