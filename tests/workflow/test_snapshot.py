@@ -11,6 +11,10 @@ from iif_core.evaluation import metrics
 from workflow.artifacts.store import StageReader, material_maps
 from workflow.scene.normal_form import CaptureReader
 
+ROOM = """\
+source: {kind: builtin, scene: kitchen}
+capture: {dynamic_range: ldr, denoise: true}
+"""
 KITCHEN = """
 capture: {views: 8, width: 96, height: 96, samples: 32}
 prior: {kind: simulated, samples: 5}
@@ -26,9 +30,9 @@ GAIN = 0.1
 
 @pytest.fixture(scope="module")
 def kitchen(repository, tmp_path_factory):
-    """The scene of the README with fewer and smaller photographs, as far as its scores."""
+    """The room of the README, rendered with fewer and smaller photographs, as far as its scores."""
     workflow = Workflow(repository, tmp_path_factory.mktemp("kitchen") / "run")
-    workflow.write("kitchen", (repository / "config/scenes/kitchen.yaml").read_text())
+    workflow.write("kitchen", ROOM)
     workflow.write_quality("draft", KITCHEN)
     result = workflow.run("results/kitchen/metrics/manifest.json")
     assert result.returncode == 0, result.stderr[-4000:]
@@ -37,8 +41,7 @@ def kitchen(repository, tmp_path_factory):
 
 def test_photographs_alone_reach_what_they_did(kitchen):
     """The user's path: default prior, objects from the mesh, no truth but for the score."""
-    text = (kitchen.repository / "config/scenes/kitchen.yaml").read_text()
-    kitchen.write("plain", text + "prior: {kind: learned, samples: 8}\nsegmentation: {kind: geometry}\n")
+    kitchen.write("plain", ROOM + "prior: {kind: learned, samples: 8}\nsegmentation: {kind: geometry}\n")
     result = kitchen.run("results/plain/base_scores/manifest.json", "results/plain/second_look/manifest.json")
     assert result.returncode == 0, result.stderr[-4000:]
     table = pq.read_table(kitchen.folder / "results/plain/base_scores/scores.parquet").to_pandas()
