@@ -1,6 +1,6 @@
 """Which inputs does the learned prior use? Predictions with some inputs withheld, scored against the truth.
 
-    python lab/benchmarks/prior_inputs.py results/kitchen/capture results/country-kitchen/capture [--every 3]
+    python -m lab.benchmarks.prior_inputs results/kitchen/capture results/country-kitchen/capture [--every 3]
 
 A group of inputs is withheld by the mean of each of its channels over the pixels of the room. The network was trained with all of
 them, so a loss says how much it relies on a group, and not what a network would reach that was trained without it.
@@ -15,18 +15,13 @@ from types import SimpleNamespace
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
+from iif_core.evaluation.metrics import Target, material_masks
+from iif_core.priors.features import CHANNELS, features
+from iif_core.priors.hypotheses import combined
+from workflow.artifacts.store import StageReader
+from workflow.priors.correction import Correction
 from workflow.runtime import native
-
-native.prepare()
-
-from iif_core.evaluation.metrics import Target, material_masks  # noqa: E402
-from iif_core.priors.features import CHANNELS, features  # noqa: E402
-from iif_core.priors.hypotheses import combined  # noqa: E402
-from workflow.artifacts.store import StageReader  # noqa: E402
-from workflow.priors.correction import Correction  # noqa: E402
-from workflow.scene.normal_form import CaptureReader  # noqa: E402
+from workflow.scene.normal_form import CaptureReader
 
 SETTINGS = SimpleNamespace(prior=SimpleNamespace(samples=8, device="cpu"), segmentation=SimpleNamespace(kind="geometry"))
 WITHHELD = {
@@ -98,6 +93,7 @@ def main() -> int:
     parser.add_argument("captures", type=Path, nargs="+")
     parser.add_argument("--every", type=int, default=3)
     options = parser.parse_args()
+    native.prepare()  # before anything loads Mitsuba
     every = {}
     for folder in options.captures:
         every[folder] = measure(folder, options.every)

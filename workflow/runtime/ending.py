@@ -1,4 +1,4 @@
-"""How a command of `python -m workflow` or `python -m lab` ends: with 0, or with one message that says what to do."""
+"""How a command such as `python -m workflow` ends: with 0, or with one message that says what to do."""
 
 from __future__ import annotations
 
