@@ -88,6 +88,22 @@ def test_walls_and_ceilings_are_mostly_grey_and_bright():
     assert np.max(saturation) > 0.5, "saturated walls must occur, if rarely"
 
 
+def test_half_of_the_walls_and_most_ceilings_have_no_gloss_and_few_things(coloured):
+    palettes = [palette.Palette(np.random.default_rng(seed), coloured) for seed in range(40)]
+    matte = {
+        place: np.mean([[materials.entry(p.material(place), "r_0") == 1 for _ in range(20)] for p in palettes])
+        for place in ("wall", "ceiling", "thing", "thin")
+    }
+    assert 0.35 < matte["wall"] < 0.6 < matte["ceiling"] < 0.75
+    assert 0.1 < matte["thing"] < 0.35 and matte["thin"] < 0.15
+
+
+def test_what_has_no_gloss_has_none_anywhere(coloured):
+    drawn = [palette.Palette(np.random.default_rng(seed), coloured).material("wall") for seed in range(60)]
+    for row in (row for row in drawn if materials.entry(row, "r_0") == 1):
+        assert materials.entry(row, "r_t") == materials.entry(row, "r_s") == materials.entry(row, "uneven") == 0
+
+
 @pytest.mark.parametrize("table", [palette.TONE_SHARES, palette.CLASS_SHARES])
 def test_shares_add_up(table):
     assert all(sum(shares) == pytest.approx(1, abs=1e-9) for shares in table.values())

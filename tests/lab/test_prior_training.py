@@ -91,6 +91,22 @@ def test_weights_of_an_earlier_training_start_a_new_one(folder, tmp_path):
         training.Trainer(training.Plan(tmp_path / "nothing", tmp_path / "out2", steps=1, **SMALL)).train()
 
 
+def test_a_wider_network_starts_where_the_narrower_one_ended():
+    torch.manual_seed(1)
+    narrow = PriorNetwork(len(CHANNELS), (16, 24, 32), 3).eval()
+    wide = PriorNetwork(len(CHANNELS), (16, 40, 64), 3).eval()
+    for parameter in narrow.parameters():  # as far from the start as training takes it
+        parameter.data += 0.05 * torch.randn_like(parameter)
+    network.load_weights(wide, narrow.state_dict())
+    x = torch.randn(2, len(CHANNELS), 32, 32)
+    with torch.no_grad():
+        expected, found = narrow(x), wide(x)
+    assert (found - expected).square().mean() < 0.02 * expected.var()
+    assert not torch.equal(found, expected)  # copies that stayed equal would never learn anything different
+    with pytest.raises(ValueError):
+        network.load_weights(narrow, wide.state_dict())
+
+
 def test_a_pool_forgets_its_oldest_crops():
     pool = training.Pool(8, EDGE, "cpu")
     first, second = crops_of(1), crops_of(2)
