@@ -12,8 +12,8 @@ from iif_core.errors import InputError
 def missing(message: str, *names: object) -> list[str]:
     """Which of `names` do not stand in `message` as whole tokens.
 
-    A token may end a longer path or key (`x.yaml` in config/scenes/x.yaml, `views` in capture.views) but not begin one: `capture` is
-    missing in "capture.views", and 3 in "-3", "0.3" and "3.5".
+    A token may end a longer path or key (`x.yaml` in config/scenes/x.yaml, `views` in capture.views) but not begin one: `capture`
+    is missing in "capture.views", and 3 in "-3", "0.3" and "3.5".
     """
     absent = []
     for name in map(str, names):
@@ -36,7 +36,7 @@ def named(message: str, *names: object) -> None:
 
 @contextmanager
 def refused(*names: object, kind: type[Exception] = InputError) -> Generator[pytest.ExceptionInfo, None, None]:
-    """Expect an error of exactly this kind (no subclass) whose message names all of `names`: file, key, found and allowed values."""
+    """Expect an error of exactly this kind (no subclass) that names all of `names`: file, key, found and allowed values."""
     with pytest.raises(kind) as caught:
         yield caught
     assert caught.type is kind, f"a {caught.type.__name__}: {caught.value}"
