@@ -5,6 +5,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 
 import pytest
+from pydantic import ValidationError
 
 from iif_core.errors import InputError
 
@@ -41,3 +42,16 @@ def refused(*names: object, kind: type[Exception] = InputError) -> Generator[pyt
         yield caught
     assert caught.type is kind, f"a {caught.type.__name__}: {caught.value}"
     named(str(caught.value), *names)
+
+
+@contextmanager
+def misset(key: str, kind: str = "value_error", *names: object) -> Generator[pytest.ExceptionInfo, None, None]:
+    """Expect pydantic to refuse the setting `key` (dotted) with an error of its type `kind` that names all of `names`."""
+    with pytest.raises(ValidationError) as caught:
+        yield caught
+    faults = {}
+    for fault in caught.value.errors():
+        place = ".".join(part for part in map(str, fault["loc"]) if part.isidentifier() or part.isdigit())  # without types
+        faults[place, fault["type"]] = fault["msg"]
+    assert (key, kind) in faults, faults
+    named(faults[key, kind], *names)

@@ -434,7 +434,7 @@ def test_unknown_derived_scenes(folder, scene, words):
 
 def test_unlisted_scenes(folder):
     folder("scenes/u", SCENE)
-    with refused("config/studies/scenes.yaml", "u", "t"):
+    with refused("config/studies/scenes.yaml: u", "t"):
         settings.load("u--a-full-s0")
     folder("studies/scenes", SHARED + "kitchn: {}\n")
     with refused("config/studies/scenes.yaml", "kitchn", "source"):
