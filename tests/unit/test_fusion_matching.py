@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from iif_core.errors import InputError
 from iif_core.fusion.direct import describe_fit, solve_direct
 from iif_core.fusion.matching import identity_penalty, penalised_affine, penalised_gain
 from iif_core.fusion.options import FusionOptions
 from iif_core.fusion.reference_loss import loss_of_result
 from iif_core.fusion.sgd.options import sgd_options
 from iif_core.fusion.sgd.solve import converged, solve_sgd
+from tests.errors import refused
 from tests.unit.test_fusion_direct import simulated
 
 
@@ -124,10 +124,10 @@ def test_polish_counts_only_usable_predictions():
 def test_a_selection_that_does_not_fit_is_refused(chosen):
     problem, _ = simulated()
     if chosen is None:
-        with pytest.raises(InputError, match="needs objective `distribution`"):
+        with refused("selection", "objective", "distribution"):
             solve_direct(problem, chosen=np.zeros((problem.n_segments, 3), int))
     else:
-        with pytest.raises(InputError, match="chosen predictions"):
+        with refused("predictions", "(2, 3)", "(32, 3)", 6):
             solve_direct(problem, FusionOptions(objective="distribution"), chosen=chosen)
 
 
