@@ -387,7 +387,7 @@ def test_what_was_published_must_be_there(tmp_path, finished):
     (tmp_path / "results/s/logs").mkdir()
     (tmp_path / "results/s/logs/publish.log").touch()
     (line,) = damaged(tmp_path)
-    assert "scenes/s: " in line and line.endswith("snakemake --cores 2 scenes/s")
+    assert "scenes/s: " in line and line.endswith("snakemake --cores 2 scenes/s --forcerun publish")
     assert list(damaged(tmp_path, ["other"])) == []
     (tmp_path / "scenes").mkdir()
     (tmp_path / "scenes/s").write_text("")
