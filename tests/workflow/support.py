@@ -27,6 +27,13 @@ def planned(result: subprocess.CompletedProcess) -> set[str]:
     return set(re.findall(r"^(\w+) +\d+ *$", table, re.M)) - {"scenes"}
 
 
+def error_of(result: subprocess.CompletedProcess) -> str:
+    """The last line of a run that failed, which is its one error, without `error: `."""
+    last = result.stderr.strip().splitlines()[-1]
+    assert result.returncode == 1 and last.startswith("error: ") and "Traceback" not in result.stderr, result.stderr[-3000:]
+    return last.removeprefix("error: ")
+
+
 def manifests(folder: Path) -> dict[str, str]:
     """Digest of every stage manifest but publish's, whose timings differ from run to run."""
     return {
