@@ -48,7 +48,7 @@ def test_a_folder_without_scenes_knows_those_of_the_repository(repository, tmp_p
     assert "publishing scenes/kitchen" in succeeded(elsewhere.run("scenes/kitchen", "-n"))
     assert "relight-kitchen-s0: relighting" in succeeded(elsewhere.run("relight/kitchen", "-n"))
     misspelt = elsewhere.run("scenes/kichen", "-n")
-    named(error_of(misspelt), "kichen", "scenes/kitchen")
+    named(error_of(misspelt), "config/scenes/kichen.yaml", "scenes/kitchen")
 
 
 def test_the_template_is_no_stage(fresh):
