@@ -240,7 +240,7 @@ def _load_study(path: Path, file: Path, root: Path, _stamp: int) -> Study:
     for name in variants:
         if not _VARIANT.fullmatch(name):
             raise InputError(
-                f"{path}: `variants`: found the name {name!r}; allowed are letters, digits, _ and -, the first no sign"
+                f"{path}: `variants`: found the name {name!r}; use letters, digits, _ and -, starting with a letter or digit"
             )
     for name in study.paper:
         if name not in variants:
