@@ -51,7 +51,7 @@ def test_pins_are_in_their_locks(repository):
 
 def test_licences_of_every_locked_package_are_listed(repository):
     """With its version; and what lies in the repository is the file that the page means."""
-    page = (repository / "docs/reference/licences.md").read_text()
+    page = (repository / "envs/licences.md").read_text()
     rows = re.findall(r"^\| ([\w.-]+) \| (\d[^|]*) \| ([^|]+) \| (\w+) \|$", page, re.M)
     wanted = {(name, version) for lock in LOCKS for name, version in locked(repository, lock)}
     assert {(name, version) for name, version, _, _ in rows} == wanted

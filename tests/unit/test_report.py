@@ -659,7 +659,7 @@ def test_commands_name_scene_and_quality():
 
 def test_page_says_what_matters(toy):
     text = "".join(parsed((toy / "scenes/toy/report.html").read_text()).text)
-    for wanted in ("geometry: good", "1 lamp found", "How do I go on?", "objects.csv", "snakemake --cores 2 relight/toy"):
+    for wanted in ("geometry: good", "1 lamp found", "What next?", "objects.csv", "snakemake --cores 2 relight/toy"):
         assert wanted in text
     for wanted in (
         "by <nobody> & co",

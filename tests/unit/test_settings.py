@@ -237,9 +237,11 @@ def test_generated_files_are_current(repository):
     assert (repository / "docs/reference/settings.md").read_text() == settings.reference_markdown()
 
 
-def test_bounds_are_words():
+def test_the_page_has_ranges_and_each_line_once():
     text = settings.reference_markdown()
-    assert "(at least 1, at most 64)" in text and "Ge(" not in text
+    assert "(1 to 64)" in text and "(> 0)" in text and "Ge(" not in text
+    lines = [line for line in text.splitlines() if line.startswith("| `")]
+    assert len(lines) == len(set(lines)) and "Also of `learned`: `seed`." in text
 
 
 def test_registry_is_ordered_and_its_settings_exist(repository):

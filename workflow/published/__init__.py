@@ -1,1 +1,1 @@
-"""Stages as the published method has them, to compare with (docs/method/published.md)."""
+"""Stages as the published method has them, to compare with (lab/docs/published.md)."""

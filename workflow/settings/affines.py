@@ -99,12 +99,12 @@ class Affines(Section):
     }
 
     model: Literal["objects", "base", "object_mean", "texture_average", "fipt", "iris"] = "objects"
-    """`objects`: one affine map per object. Baselines under the same light (docs/development/studies.md): `base`: nothing is
+    """`objects`: one affine map per object. Baselines under the same light (lab/docs/studies.md): `base`: nothing is
     fitted; `object_mean`: mean prediction of each object; `texture_average`: mean photographed colour of each cell as albedo;
     `fipt`, `iris`: a free BRDF in every cell."""
     solver: Literal["direct", "sgd", "adam", "published"] = "direct"
     """With `objects`: `direct`: Gauss-Newton; `sgd`: stochastic gradient descent on the paper's loss; `adam`: Adam on the same
-    loss; `published`: the paper's descent to the letter (docs/method/published.md#materials). With `fipt`, `iris`: `direct`:
+    loss; `published`: the paper's descent to the letter (lab/docs/published.md#materials). With `fipt`, `iris`: `direct`:
     exact for every cell; `adam`: gradient descent on the same loss."""
     response: Literal["auto", "identity", "srgb", "gamma", "ggcm", "spline"] | ResponseFile = "auto"
     """Family of the camera response, or `{file: curve.csv}` for a measured one (CSV or Parquet with columns `x, R, G, B`, or NPY

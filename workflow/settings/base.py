@@ -53,7 +53,7 @@ class Base(Section):
     seams: bool = _DEFAULT.seams
     """`direct`: close seams between parts of an object that no photograph shows together."""
     preset: Literal["safe", "paper"] = "safe"
-    """`sgd`: `paper` = the published behaviour; `safe` = with the numerical safeguards of docs/method/fusion.md#schedules. Sets
+    """`sgd`: `paper` = the published behaviour; `safe` = with the numerical safeguards of lab/docs/published.md#schedules. Sets
     the defaults of the settings below."""
     texture: Literal["cells", "hashgrid"] | None = None
     """`sgd`: texture model; default: `cells`, `preset: paper` the hash grid."""

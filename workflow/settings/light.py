@@ -50,7 +50,7 @@ class Emission(Section):
     enough rays leave the mesh and what they meet is not black."""
     solver: Literal["direct", "sgd", "published", "published_repaired"] = "direct"
     """`direct`: non-negative least squares; `sgd`: the paper's gradient descent on the same pixels, for comparison. `published`:
-    the paper's method; `published_repaired`: without its errors (docs/method/published.md#emission)."""
+    the paper's method; `published_repaired`: without its errors (lab/docs/published.md#emission)."""
     preset: Literal["safe", "paper"] = _SGD.preset
     """`sgd`: `paper`: the published step size and pruning; `safe`: steps scaled by the diagonal of the normal matrix, and the
     average of the last iterates."""
@@ -68,7 +68,7 @@ class Shading(Section):
     method: Literal["shared_paths", "published"] = "shared_paths"
     """`shared_paths`: all lobes from one set of paths, diffuse light once for every surface cell; `published`: as the paper has
     it, at every pixel 256 paths for diffuse light and 64 to 128 for each of 6 levels, of one bounce, and the denoiser
-    (docs/method/published.md#shading)."""
+    (lab/docs/published.md#shading)."""
 
     pixels: Annotated[Literal["auto", "all"] | Annotated[int, Field(ge=100)], word_or_count("auto", "all", least=100)] = "auto"
     """Pixels of which specular light is traced, drawn evenly over the objects. `auto`: as many as the fit reads

@@ -24,7 +24,7 @@ class SceneSettings(Section):
 
     preset: Literal["ours", "published", "published_repaired"] = "ours"
     """`published`: every stage as the paper has it, to compare with; `published_repaired`: the same without its errors
-    (docs/method/published.md). Presets are files of settings, config/presets/, right below the file that names them."""
+    (lab/docs/published.md). Presets are files of settings, config/presets/, right below the file that names them."""
     source: Source
     """Where photographs, cameras and mesh come from."""
     capture: Capture = Capture()
