@@ -1,5 +1,32 @@
-"""What the laboratory adds to the product, by name (workflow/plugins.py)."""
+"""What the laboratory adds to the product, by name (workflow/plugins.py): rooms with ground truth and what needs it."""
 
-from __future__ import annotations
-
-KINDS: dict[str, dict[str, tuple[str, str]]] = {}
+KINDS = {
+    "source": {
+        "builtin": ("lab.sources.builtin", "lab.settings.source:BuiltinSource"),
+        "mitsuba": ("lab.sources.mitsuba", "lab.settings.source:MitsubaSource"),
+    },
+    "prior": {"simulated": ("lab.simulated.prior", "lab.settings.prior:SimulatedPrior")},
+}
+SECTIONS = {"scene": "lab.settings.scene:LabScene"}
+ADDED = {
+    "relit_truth": {
+        "place": "lab.relit.truth",
+        "upstream": ("capture",),
+        "settings": ("source", "relit", "seed"),
+        "reads_raw": True,
+        "files": ("lab.relit.sources",),
+    },
+    "relit_scores": {
+        "place": "lab.relit.scores",
+        "upstream": ("capture", "segmentation", "base", "emission", "second_look", "affines", "relit_truth"),
+        "settings": ("relit", "seed"),
+    },
+}
+SIZES = {"builtin": "lab.work:faces_of_room", "mitsuba": "lab.work:faces_of_files"}
+COSTS = {
+    "builtin": "lab.work:rendered",
+    "mitsuba": "lab.work:rendered",
+    "relit_truth": "lab.work:relit_truth",
+    "relit_scores": "lab.work:relit_scores",
+}
+SCENES = "lab/config/scenes"

@@ -194,10 +194,10 @@ def test_a_base_may_lack_what_the_line_gives(project, tmp_path):
         ("a\t\t\ttpl\tcapture.veiws=3", ["line 2, column overrides", "capture.veiws", "views"]),
         ("a\t\t\ttpl\tcapture.views=0", ["line 2, column overrides", "capture.views", 0, 1]),
         ("a\t\t\ttpl\tcapture=3", ["line 2, column overrides", "capture", 3, "key: value"]),
-        ("a\tfoldr\tx\t\tprior.kind=retinex", ["line 2, column source", "source.kind", "'foldr'", "builtin, mitsuba, folder"]),
+        ("a\tfoldr\tx\t\tprior.kind=retinex", ["line 2, column source", "source.kind", "'foldr'", "fipt, builtin, mitsuba"]),
         ("a\tfolder\t\t\tprior.kind=retinex", ["line 2, column path", "source.path", "config/scenes/kitchen.yaml"]),
         ("a\tfolder\tx\t\tprior.kind=retinx", ["line 2, column overrides", "prior.kind", "'retinx'", "retinex"]),
-        ("a\tbuiltin\tx\ttpl\tprior.kind=simulated", ["line 2, column path", "source.path", "builtin", "source.kind"]),
+        ("a\tbuiltin\tx\ttpl\tprior.kind=simulated", ["line 2, column path", "source.path", "kind, quarterings, scene"]),
         ("a\t\t\ttlp\t", ["line 2, column base", "config/scenes/tlp.yaml", "tpl"]),
         ("a\t\t\ttpl\tviews", ["line 2, column overrides", "'views'", "key=value"]),
         ("a\t\t\tbad\t", ["config/scenes/bad.yaml", "config/batch.tsv, line 2", "seed", "'x'"]),
@@ -233,7 +233,7 @@ def test_every_scene_is_refused_by_itself(project, monkeypatch):
         "gone\n"
         "disk\tmitsuba\tx.xml\t\tprior.kind=simulated\n"
     )
-    from workflow.sources import mitsuba
+    from lab.sources import mitsuba
 
     monkeypatch.setattr(mitsuba, "raw_inputs", lambda document: 1 / 0)
     plan = batch_plan.plan("draft")

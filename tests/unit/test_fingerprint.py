@@ -210,7 +210,7 @@ def test_what_is_remembered_of_the_code_changes_nothing(checkout):
         "stages = ['render', 'affines', 'emission', 'base'] * 4;"
         "list(P(8).map(lambda s: f.fingerprint(s, 't', 'draft'), stages))"
     )
-    environment = {"PYTHONPATH": str(code), "PATH": "/usr/bin:/bin"}
+    environment = {"PYTHONPATH": str(code), "PATH": "/usr/bin:/bin", plugins.VARIABLE: "lab.plugins"}
     subprocess.run([sys.executable, "-c", threads], cwd=run, env=environment, check=True)
     before = affines.stat()
     affines.write_text(affines.read_text() + "\nEXTRA = 1\n")

@@ -12,9 +12,10 @@ import trimesh
 from PIL import Image
 
 from iif_core.errors import InputError
+from lab.sources import mitsuba
 from tests.errors import missing, refused
+from tests.lab.test_mitsuba_source import ROOM, write
 from tests.unit import own_scene as own
-from tests.unit.test_mitsuba_source import ROOM, write
 from workflow.artifacts.files import inside
 from workflow.intake import limits
 from workflow.intake.arrays import read_npy
@@ -25,7 +26,6 @@ from workflow.relighting.inserts import load_insert
 from workflow.runtime.fingerprint import raw_inputs
 from workflow.scene.response_file import read_response_file
 from workflow.settings.yaml_file import read_yaml
-from workflow.sources import mitsuba
 from workflow.sources.folder_scene import images, mesh, transforms
 
 BAD_NAMES = ("", " ", ".", "..", ".x", "a/b", "a\\b", "a\0b", "a\nb", "a\x1b[31m", "\u202egpj", "\ud800", "x" * (LONGEST + 1))

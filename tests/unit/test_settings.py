@@ -96,7 +96,10 @@ def test_scene_over_preset_over_default(scene):
         (GOOD + "capture: {views: 0}\n", ["capture.views", 0, 1]),
         (GOOD + "capture: {dynamic_range: mdr}\n", ["capture.dynamic_range", "'mdr'", "'ldr' or 'hdr'"]),
         ("source: {kind: builtin}\nprior: {kind: simulated, samples: 0}\n", ["prior.samples", 0, 1]),
-        ("source: {kind: buildin}\nprior: {kind: simulated}\n", ["source.kind", "'buildin'", "builtin, mitsuba, folder"]),
+        (
+            "source: {kind: buildin}\nprior: {kind: simulated}\n",
+            ["source.kind", "'buildin'", "folder, scannetpp, fipt, builtin, mitsuba"],
+        ),
         ("source: {kind: builtin}\nprior: {samples: 30}\n", ["prior.samples", 30, 16]),
         ("source: {kind: mitsuba}\nprior: {kind: simulated}\n", ["source.path", "config/scenes/kitchen.yaml"]),
         (GOOD + "affines: {scale: {kind: prior}}\n", ["affines.scale.kind", "lamp, mean_albedo, white_patch"]),
