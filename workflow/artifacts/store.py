@@ -219,7 +219,7 @@ def _write_bytes(path: Path, data: bytes) -> None:
 
 class StageReader:
     """Reads a finished stage. Every file is checked against the manifest when it is opened; its content is hashed once in a
-    process, as long as nobody touches it.
+    process, as long as nobody touches it. `digest` is the SHA-256 of the manifest.
 
     Raises:
         DamagedArtefact: the manifest is missing or of another schema, a file is missing or has another hash, or a value is not
@@ -232,7 +232,7 @@ class StageReader:
         if not path.is_file():
             raise DamagedArtefact(path, stage, scene, "missing, so this stage is not finished", unfinished=True)
         try:
-            self.manifest = manifests.read(path)
+            self.manifest, self.digest = manifests.load(path)
         except manifests.Broken as error:
             raise DamagedArtefact(path, stage, scene, str(error), quality_in(path)) from None
         of = {key: self.manifest.get(key, own) for key, own in (("stage", stage), ("scene", scene))}

@@ -21,7 +21,7 @@ from typing import IO, Any, NamedTuple
 from iif_core.errors import InputError
 from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter, links, stamps
-from workflow.artifacts.files import read_record, sha256_of, write_json
+from workflow.artifacts.files import read_record, write_json
 from workflow.registry import SHARED, STAGES
 from workflow.runtime import device, events, forecast
 from workflow.runtime import fingerprint as fp
@@ -135,7 +135,7 @@ class Job:
             name: {
                 "scene": reader.scene,
                 "fingerprint": reader.fingerprint,
-                "manifest_sha256": sha256_of(reader.directory / "manifest.json"),
+                "manifest_sha256": reader.digest,
             }
             for name, reader in readers.items()
         }

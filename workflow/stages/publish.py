@@ -120,7 +120,7 @@ def _manifest(job: Job, files: dict[str, Any]) -> dict[str, Any]:
         "quality": job.quality,
         "fingerprint": job.fingerprint,
         "fingerprints": {stage: job.read(stage).fingerprint for stage in job.stage.upstream},
-        "manifests": {stage: sha256_of(job.read(stage).directory / MANIFEST) for stage in job.stage.upstream},
+        "manifests": {stage: job.read(stage).digest for stage in job.stage.upstream},
         "settings": job.document,
         "versions": library_versions(),
         "files": files,
