@@ -62,6 +62,20 @@ def test_round_trip(stage):
     assert reader.json("base.json") == {"edge": 0.01}
 
 
+def test_a_file_is_hashed_once_in_a_process_until_somebody_touches_it(stage, monkeypatch):
+    folder, read = stage[0], []
+    original = files.sha256_of
+    monkeypatch.setattr(files, "sha256_of", lambda path: read.append(path.name) or original(path))
+    for _ in range(3):
+        StageReader(folder, "base", "s").exr("maps/v.exr")
+    assert read == ["v.exr"]
+    data = bytearray((folder / "maps/v.exr").read_bytes())
+    data[len(data) // 2] ^= 1
+    (folder / "maps/v.exr").write_bytes(data)
+    with pytest.raises(DamagedArtefact, match="its content changed"):
+        StageReader(folder, "base", "s").exr("maps/v.exr")
+
+
 @pytest.mark.parametrize("name, reader", [("maps/v.exr", "read_exr"), ("cells.parquet", "read_parquet")])
 def test_an_error_of_the_disk_is_not_called_damage(stage, monkeypatch, name, reader):
     """What a library says of the content of a file is damage."""

@@ -59,12 +59,11 @@ class StageWriter:
         self.files: dict[str, dict[str, Any]] = {}
         self.stamps = Stamps()
         self.parts: dict[str, Any] = {}
+        self._earlier = _noted_parts(directory)
         if directory.is_symlink():
             raise links.refused(directory)
         with io.named(directory):
             io.make_folder(directory)
-            for part, note in _noted_parts(directory).items():
-                manifests.write(io.inside(directory, f"{UNFINISHED}/{part}.json"), note, settled=False)
             io.remove(directory / MANIFEST)
 
     def exr(
@@ -134,7 +133,7 @@ class StageWriter:
         """
         note = io.inside(self.directory, f"{UNFINISHED}/{part}.json")
         try:
-            done = manifests.part(manifests.sealed(note.read_bytes()))
+            done = manifests.part(manifests.sealed(io.read_record(note)) if note.exists() else self._earlier.get(part))
         except (OSError, manifests.Broken):
             return None
         if done["by"] != (by or self.provenance["fingerprint"]):
@@ -207,10 +206,9 @@ def _noted_parts(directory: Path) -> dict[str, Any]:
     not in the manifest, which Snakemake removes before it starts a job."""
     try:
         noted = manifests.sealed(io.read_record(directory / PARTS)).get("parts")
-        parts = {name: manifests.part(note) for name, note in noted.items()} if isinstance(noted, dict) else {}
-        return parts if all(io.is_inside(directory, name) for name in parts) else {}
     except (OSError, manifests.Broken):
         return {}
+    return noted if isinstance(noted, dict) else {}
 
 
 def _write_bytes(path: Path, data: bytes) -> None:
