@@ -37,11 +37,11 @@ def stage_faults(results: Path, scene: str, stage: str, fingerprint: str) -> tup
         InputError: a link is where jobs of the scene write.
     """
     _without_links(results, scene)
-    folder, noted = results / scene / stage, place(results, scene, stage)
+    folder = results / scene / stage
     if not (folder / MANIFEST).is_file():  # a job that makes it again and is killed leaves the stamps as well
         gone = folder / MANIFEST if folder.is_dir() else folder
-        return (f"{gone}: missing, although it was finished",) if noted.is_file() else ()
-    return tuple(_faults(folder, Stamps(noted), STAGE_SCHEMA, {"scene": scene, "stage": stage}, fingerprint))
+        return (f"{gone}: missing, although it was finished",) if place(results, scene, stage).is_file() else ()
+    return tuple(_faults(folder, _noted(results, scene, stage), STAGE_SCHEMA, {"scene": scene, "stage": stage}, fingerprint))
 
 
 @lru_cache(None)
@@ -62,7 +62,7 @@ def deliverable_faults(folder: Path, results: Path, scene: str, fingerprint: str
         return ()
     if not (folder / MANIFEST).is_file():
         return (f"{folder / MANIFEST}: missing",)
-    noted = Stamps(place(results, scene, DELIVERABLE))
+    noted = _noted(results, scene, DELIVERABLE)
     return tuple(_faults(folder, noted, SCENE_SCHEMA, {"scene": scene}, fingerprint))
 
 
@@ -141,8 +141,9 @@ def made_from_another(folder: Path, document: dict[str, Any]) -> Iterator[str]:
 @lru_cache(None)
 def _digest_of(results: Path, scene: str, stage: str) -> str | None:
     """Return the SHA-256 of the manifest of a stage; None if it is not there or damaged, as its own stage reports."""
+    path, noted = results / scene / stage / MANIFEST, _noted(results, scene, stage)
     try:
-        return _manifest(results / scene / stage / MANIFEST, Stamps(place(results, scene, stage)), STAGE_SCHEMA)[1]
+        return noted.known(path) or _manifest(path, noted, STAGE_SCHEMA)[1]
     except manifests.Broken:
         return None
 
@@ -155,7 +156,7 @@ def copy_faults(folder: Path, results: Path, scene: str, stage: str) -> tuple[st
         InputError: a link is where jobs of the scene write.
     """
     _without_links(results, scene)
-    source, noted = results / scene / stage / MANIFEST, Stamps(place(results, scene, f"{stage} {folder.name}"))
+    source, noted = results / scene / stage / MANIFEST, _noted(results, scene, f"{stage} {folder.name}")
     if not folder.is_dir() or not source.is_file():
         return ()
     try:
@@ -167,6 +168,12 @@ def copy_faults(folder: Path, results: Path, scene: str, stage: str) -> tuple[st
     return problems
 
 
+@lru_cache(64)
+def _noted(results: Path, scene: str, of: str) -> Stamps:
+    """Return the stamps of a folder; those of a scene are kept while its stages are compared with one another."""
+    return Stamps(place(results, scene, of))
+
+
 @lru_cache(None)
 def _without_links(results: Path, scene: str) -> None:
     """Look for links once in a plan, before it notes anything."""
@@ -175,7 +182,7 @@ def _without_links(results: Path, scene: str) -> None:
 
 def forget() -> None:
     """Compare anew what was compared: the results are kept for one plan."""
-    for compared in (stage_faults, deliverable_faults, copy_faults, _digest_of, _without_links):
+    for compared in (stage_faults, deliverable_faults, copy_faults, _digest_of, _noted, _without_links):
         compared.cache_clear()
 
 
