@@ -121,7 +121,7 @@ def test_deep_settings_do_not_kill_the_process(tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "names"),
     [
-        ("x: &x [*x]", ["anchor", 32]),
+        ("x: &x [*x]", ["anchors", 32]),
         ("\n".join(f"k{i}: 1" for i in range(40_000)), [20000]),
         ("a: 2026-02-30", ["YAML"]),
         ("a: 1e308", ["line 1", "1e308", "1e+12"]),

@@ -164,6 +164,6 @@ def load(path: Path, schema: str = STAGE_SCHEMA) -> tuple[dict[str, Any], str]:
     """
     try:
         data = read_record(path)
-    except OSError as error:
-        raise Broken(f"not readable ({error.strerror})") from None
+    except (OSError, ValueError) as error:
+        raise Broken(f"not readable ({getattr(error, 'strerror', error)})") from None
     return parse(data, schema), hashlib.sha256(data).hexdigest()

@@ -33,7 +33,7 @@ def stamp_of(path: Path | str) -> Stamp | None:
     """Return (bytes, time stamp of the content in ns, time stamp of the inode in ns, inode); None if there is no such file."""
     try:
         status = os.stat(path)
-    except OSError:
+    except (OSError, ValueError):  # a name with a zero byte
         return None
     return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino
 
@@ -68,7 +68,7 @@ class Stamps:
             files = document.get("files")
             if document.get("by") == by and isinstance(files, dict):
                 self._facts = {path: kept for path, kept in files.items() if isinstance(kept, list) and len(kept) == 2}
-        except (OSError, manifests.Broken):
+        except (OSError, ValueError):
             pass
 
     def known(self, path: Path | str) -> Any:

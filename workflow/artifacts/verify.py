@@ -59,7 +59,7 @@ def _of_results(results: Path, scene: str) -> Iterator[str]:
             needed.setdefault(folder, (folder, None))
     for stage, (made, quality) in sorted(needed.items()):
         if not (stage / MANIFEST).is_file():
-            again = f"snakemake --cores 2 {stage.relative_to(results.parent)}/{MANIFEST}{chosen(quality)}"
+            again = f"snakemake --cores 2 results/{stage.parent.name}/{stage.name}/{MANIFEST}{chosen(quality)}"
             again = command(scene, "publish", quality) if stage.name == "publish" else again
             why = "it was finished" if made == stage else f"{made} was made from it"
             yield f"{stage / MANIFEST}: missing, although {why}; rebuild with: {again}"
