@@ -17,7 +17,6 @@ from tests.errors import missing, named, refused
 from workflow import settings
 from workflow.artifacts import StageWriter, sound, stamps
 from workflow.artifacts.files import write_exr, write_json, write_parquet
-from workflow.artifacts.manifest import EARLIER_SCHEMA
 from workflow.batch import causes, summary
 from workflow.batch import plan as batch_plan
 from workflow.runtime import fingerprint as fp
@@ -256,30 +255,24 @@ def segmented(scene):
     writer = StageWriter(Path("results") / scene / "segmentation", facts)
     writer.table("objects.parquet", {"object_id": np.arange(1), "name": ["floor"]})
     writer.finish()
-    stamps.stamp_stage(Path("results"), scene, "segmentation")
+    writer.stamps.save(stamps.place(Path("results"), scene, "segmentation"))
     sound.forget()
     return Path("results") / scene / "segmentation"
 
 
 def test_what_lies_in_the_folders_of_a_scene_refuses_that_scene_alone(project):
-    project(
-        "".join(f"{name}\t{SMALL}\n" for name in ("good", "file", "stage", "logs", "earlier", "link")) + f"name\t{WRONG_NAME}\n"
-    )
+    project("".join(f"{name}\t{SMALL}\n" for name in ("good", "file", "stage", "logs", "link")) + f"name\t{WRONG_NAME}\n")
     for path in ("scenes/file", "results/stage/render", "results/logs/logs"):
         Path(path).parent.mkdir(parents=True)
         Path(path).touch()
     Path("scenes/link").symlink_to("../config")
     segmented("name")
-    manifest = segmented("earlier") / "manifest.json"
-    document = json.loads(manifest.read_text())
-    write_json(manifest, document | {"schema": EARLIER_SCHEMA})
     plan = batch_plan.plan("draft")
     assert list(plan.ready) == ["good"]
     for name, names in {
         "file": ["scenes/file"],
         "stage": ["results/stage/render"],
         "logs": ["results/logs/logs"],
-        "earlier": ["python -m workflow upgrade earlier"],
         "name": ["overrides", "'nosuchthing'"],
         "link": ["scenes/link"],
     }.items():

@@ -121,12 +121,12 @@ def test_deep_settings_do_not_kill_the_process(tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "names"),
     [
-        ("x: &x [*x]", ["line 1", "anchor"]),
-        ("\n".join(f"k{i}: 1" for i in range(40_000)), ["line 1", 20000]),
+        ("x: &x [*x]", ["anchors", 32]),
+        ("\n".join(f"k{i}: 1" for i in range(40_000)), [20000]),
         ("a: 2026-02-30", ["YAML"]),
         ("a: 1e308", ["line 1", "1e308", "1e+12"]),
         ("a: .nan", ["nan", "1e+12"]),
-        (f"a: {'9' * 400}", ["line 1", 400, 40]),
+        (f"a: {'9' * 400}", ["9" * 40, "1e+12"]),
         (f"a: {'x' * 5000}", ["line 1", 5000, 4096]),
         ('a: "\\0"', ["line 1", "byte"]),
         ("? [a]\n: 1", ["line 1", "key"]),
