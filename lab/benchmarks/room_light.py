@@ -128,8 +128,10 @@ def traced(job: Any, document: dict[str, Any], facts: dict[str, np.ndarray], sam
     from iif_core.light.transport.geometry import trace
     from iif_core.light.transport.scene import PathOptions, Scene
     from iif_core.light.transport.shading import shading_caches
+    from workflow.runtime import device
     from workflow.scene.recovered import read_recovered
 
+    device.mitsuba()
     recovered = read_recovered(job)
     geometry, material = recovered.surface.traceable(recovered.light.emits)
     turn = np.reshape(document["worldFromRoom"], (3, 3))

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from iif_core.light.base_scene import Light
 from iif_core.light.lamps import Lamp, lamps_of
 from iif_core.light.relighting import sphere_mesh
-from workflow.scene.base_scene import Light
+from workflow.runtime import device
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import Recovered
 
@@ -122,6 +123,7 @@ def relit_world(scene: Recovered, light: NewLight, lamp_of_face: np.ndarray) -> 
         extra_side = np.ones(len(extra[1]), np.int8)
     from iif_core.light.transport.scene import Scene
 
+    device.mitsuba()
     if extra is None:
         geometry, material = surface.traceable(own)
         return Scene(geometry, material, Light(radiance, side, own, environment).emitters(geometry))

@@ -18,6 +18,7 @@ import trimesh
 from PIL import Image
 
 from iif_core.camera.pinhole import direction_derivatives, look_at, pixel_directions
+from iif_core.light.base_scene import BaseScene, Light
 from iif_core.numerics.color import linear_from_srgb
 from iif_core.surface.atlas import nearest_covered, texel_values, unwrap
 from iif_core.surface.cells import voxel_indices
@@ -47,7 +48,6 @@ from workflow.exporters.normal_map import normal_picture
 from workflow.exporters.surface import SeenSurface, build_parts, seen_sides, up_axis
 from workflow.exporters.usd import BASE_COLOR, SURFACE, usd_bytes
 from workflow.runtime import native
-from workflow.scene.base_scene import BaseScene, Light
 from workflow.scene.normal_form import View
 from workflow.scene.recovered import Recovered
 

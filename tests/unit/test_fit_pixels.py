@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from iif_core.camera.pixels import ViewPixels
 from tests.errors import refused
 from workflow.artifacts.files import read_parquet, write_parquet
 from workflow.fitting.fit_pixels import FitPixels, count_eligible
-from workflow.scene.base_scene import ViewPixels
 from workflow.scene.cached_light import SpecularLight, read_specular
 
 VIEW = SimpleNamespace(view_id=7, name="v007")

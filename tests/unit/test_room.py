@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from iif_core.light.base_scene import BaseScene
 from iif_core.light.light_maps import to_half
 from tests.unit.transport_rooms import box, quad
 from workflow.exporters.atlas import UNKNOWN, Atlas, TexturedPart
@@ -18,7 +19,6 @@ from workflow.room.light import find_lamps, lit_texels, trace_lamps
 from workflow.room.pack import array_blob, normals_to_bytes, quantized
 from workflow.room.page import NOTES, Page, policy, render_page, three_version
 from workflow.room.sources import LIBRARY, VENDORED, VIEWER
-from workflow.scene.base_scene import BaseScene
 
 
 def part(mesh, column, columns, name, object_id, emitter_id=-1, radiance=(0, 0, 0), double_sided=False):

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from iif_core.camera.pixels import ViewPixels, pixel_gains
 from iif_core.camera.response import Response, response, response_facts, response_from_facts
 from iif_core.fitting.baselines.adam import solve_adam
 from iif_core.fitting.baselines.camera import fit_camera
@@ -19,21 +20,13 @@ from iif_core.fitting.baselines.direct import solve_direct
 from iif_core.fitting.baselines.loss import FIPT, IRIS, CellFit, albedo_deviation, fill_unknown, object_means
 from iif_core.fitting.baselines.problem import DARK, CellSums, PixelRows
 from iif_core.fitting.baselines.texture import AlbedoSums, BlockLight, blocks_of
+from iif_core.light.base_scene import BaseScene
 from iif_core.reflectance.material import CHANNELS, IDENTITY, NEUTRAL, NUMBERS_OF
 from workflow.artifacts.store import ids_from_disk, split_rgb
 from workflow.fitting.inputs import balanced, cells_of, exposure_and_balance, roughness_levels
 from workflow.models.denoise import denoise, require_denoiser
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import (
-    BaseScene,
-    ViewPixels,
-    base_maps,
-    pixel_gains,
-    read_gains,
-    read_lit_scene,
-    sensor_bounds,
-    view_pixels,
-)
+from workflow.scene.base_scene import base_maps, read_gains, read_lit_scene, sensor_bounds, view_pixels
 from workflow.scene.cached_light import read_diffuse, read_specular
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import object_names, write_response

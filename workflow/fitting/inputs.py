@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from iif_core.camera.gains import CameraGains
+from iif_core.camera.pixels import pixel_gains
 from workflow.artifacts.store import ids_from_disk
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import pixel_gains
 from workflow.scene.normal_form import CaptureReader, View
 
 

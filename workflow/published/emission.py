@@ -15,6 +15,7 @@ from iif_core.camera.gains import CameraGains
 from iif_core.camera.pinhole import direction_derivatives
 from iif_core.camera.response import Response, response, response_facts
 from iif_core.errors import InputError
+from iif_core.light.base_scene import BaseScene
 from iif_core.light.emission.cache import RadianceSums, RadianceVoxels
 from iif_core.light.emission.published import (
     THRESHOLD,
@@ -26,8 +27,9 @@ from iif_core.light.emission.published import (
     descend,
 )
 from workflow.decisions import light as decisions
+from workflow.runtime import device
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import BaseScene, decode_view, read_base_scene, view_pixels
+from workflow.scene.base_scene import read_base_scene, view_pixels
 from workflow.scene.emission_pixels import gain_plan, view_exposures
 from workflow.scene.light_files import emitter_columns, write_light
 from workflow.scene.normal_form import CaptureReader, View
@@ -122,7 +124,7 @@ def _read(
     sums, total, count = RadianceSums(edge, np.full(3, corner, np.float32)), np.zeros((faces, 3)), np.zeros(faces)
     parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for number, view in enumerate(views):
-        pixels = view_pixels(job, capture, scene, view, decode_view(job, capture, view))
+        pixels = view_pixels(job, capture, scene, view)
         pixels = pixels.take(np.flatnonzero(pixels.valid))
         shown = np.clip(pixels.value, 0, 1)
         radiance = curve.inverse(shown) / exposure[number]
@@ -171,6 +173,7 @@ def _tracer(
     job: Job, scene: BaseScene, pool: _Pool, cache: RadianceVoxels, emitter_of_face: np.ndarray
 ) -> Callable[[np.ndarray, PublishedState, int], BouncePaths]:
     """Return what traces the pixels of a step: emitters that are switched off are surface again."""
+    device.mitsuba()
     geometry, material = scene.traceable()
     from iif_core.light.transport.cache import RadianceCache
     from iif_core.light.transport.emitters import Emitters

@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from iif_core.camera.pixels import ViewPixels
 from workflow.artifacts.store import split_rgb
 from workflow.models.denoise import denoise_alone, require_denoiser
+from workflow.runtime import device
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import ViewPixels, read_lit_scene, read_radiance_cache, view_pixels
+from workflow.scene.base_scene import read_lit_scene, read_radiance_cache, view_pixels
 from workflow.scene.cached_light import UNITS, SpecularLight, table_of
 from workflow.scene.normal_form import CaptureReader, View
 
@@ -39,6 +41,7 @@ def run(job: Job) -> None:
     require_denoiser()
     capture, (scene, light) = CaptureReader(job.read("capture")), read_lit_scene(job)
     levels, count = published_levels(), 0
+    device.mitsuba()
     geometry, material = scene.traceable()
     world = Scene(geometry, material, light.emitters(geometry), read_radiance_cache(job))
     for done, view in enumerate(capture.views):

@@ -17,6 +17,7 @@ from workflow.models.denoise import denoise, require_denoiser
 from workflow.relighting.camera import Flight, check_way, plan_flight
 from workflow.relighting.inventory import Inventory, check_places
 from workflow.relighting.world import World, build_world
+from workflow.runtime import device
 from workflow.runtime.fingerprint import raw_digest
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader
@@ -61,6 +62,7 @@ class Studio:
         check_places(entry, corners.min(0), corners.max(0))
         flight = plan_flight(self.capture, entry, self.up)
         if entry["camera"]["frames"] > 1 and not entry["camera"]["through_surface"]:
+            device.mitsuba()
             geometry, _ = self.room.surface.traceable()
             check_way(flight, geometry, self.room.surface.object_id, self.room.object_names, entry)
         return flight

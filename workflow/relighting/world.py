@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iif_core.errors import InputError
+from iif_core.light.base_scene import BaseScene
 from iif_core.light.environment import as_map, resample
 from iif_core.light.relighting import axes_of_map, coloured, sphere_mesh
 from workflow.artifacts.files import read_exr
@@ -18,7 +19,6 @@ from workflow.intake.pictures import exr_size
 from workflow.relighting.inserts import light_of, load_insert, placed
 from workflow.relighting.inventory import Inventory
 from workflow.runtime import device
-from workflow.scene.base_scene import BaseScene
 from workflow.scene.named import object_number
 from workflow.scene.recovered import Recovered
 from workflow.settings.relight import name_of

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from iif_core.light.base_scene import BaseScene
 from iif_core.light.environment import as_map, solid_angles
 from iif_core.light.light_maps import MOST_LAMPS, NORMAL_REACH, group_lamps, smooth, with_mean_of
 from iif_core.numerics.color import id_colours
@@ -15,7 +16,7 @@ from iif_core.surface.atlas import nearest_covered
 from iif_core.surface.triangles import face_geometry
 from workflow.exporters.atlas import TexturedPart, joined, texels_beside, texels_of
 from workflow.models.denoise import denoise
-from workflow.scene.base_scene import BaseScene
+from workflow.runtime import device
 
 if TYPE_CHECKING:
     from iif_core.light.transport.geometry import Geometry
@@ -341,7 +342,8 @@ def lit_scene(parts: Sequence[TexturedPart], surface: BaseScene, lamps: Lamps) -
     from iif_core.light.transport.geometry import build_geometry
     from iif_core.light.transport.scene import Scene
 
-    material = surface.materials()  # before anything is on the device, which it chooses
+    device.mitsuba()
+    material = surface.materials()
     start = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + first for part, first in zip(parts, start[:-1], strict=True)])

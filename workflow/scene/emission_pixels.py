@@ -22,6 +22,8 @@ from iif_core.camera.calibration.choice import (
 from iif_core.camera.gains import CameraGains, choose_gains, radius_squared, with_held_out_views
 from iif_core.camera.overlap import PatchRows, join_rows, no_rows, patch_edge, patch_numbers, patch_rows
 from iif_core.camera.pinhole import direction_derivatives
+from iif_core.camera.pixels import ViewPixels, pixel_gains, pixels_of_view
+from iif_core.light.base_scene import BaseScene, cache_origin
 from iif_core.light.emission.cache import RadianceVoxels, VoxelPixels
 from iif_core.light.emission.candidates import (
     FaceStatistics,
@@ -36,8 +38,9 @@ from iif_core.light.emission.pixels import ANCHOR_PIXELS, EmissionPixels, choose
 from iif_core.light.emission.sensor import Sensor
 from iif_core.surface.cells import grid_origin
 from workflow.decisions import camera as decisions
+from workflow.runtime import device
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import BaseScene, ViewPixels, base_maps, cache_origin, decode_view, pixel_gains, view_pixels
+from workflow.scene.base_scene import base_maps, decode_view
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.response_file import read_response_file
 
@@ -116,7 +119,7 @@ class ViewRecords:
             among = rng.random(decoded.face.size) < self.share
             shown = decoded.valid & (decoded.face >= 0) & (decoded.depth > 0) & np.isfinite(decoded.photo).all(-1)
             seen = np.unique(decoded.face[shown])
-        pixels = view_pixels(self.job, self.capture, self.scene, view, decoded, among)
+        pixels = pixels_of_view(view, decoded, self.scene.normals, among)
         base = np.zeros((0, 5), np.float32) if view.split == "test" else base_maps(self.job, view)[pixels.index]
         values = decoded.photo.reshape(-1, 3)
         counted = decoded.valid.ravel() if among is None else decoded.valid.ravel() & among
@@ -144,6 +147,7 @@ class Photographs:
     @cached_property
     def world(self) -> tuple[Geometry, CellMaterials]:
         """Geometry and materials on the device, made once."""
+        device.mitsuba()
         return self.scene.traceable()
 
     @cached_property

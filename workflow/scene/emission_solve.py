@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from iif_core.camera.pixels import ViewPixels
 from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.direct import (
     FAMILY_WIDTH,
@@ -38,7 +39,6 @@ from iif_core.light.emission.rows import TracedTransport, light_of
 from iif_core.light.emission.search import HIDDEN_EXCESS, QUICK, Candidates, Families, search
 from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
 from iif_core.surface.cells import pack_keys, voxel_indices
-from workflow.scene.base_scene import ViewPixels
 from workflow.scene.emission_pixels import SEEDS, Photographs, choose_rows, joined, radiance_cache, seen_faces
 
 if TYPE_CHECKING:

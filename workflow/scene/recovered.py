@@ -8,10 +8,11 @@ import numpy as np
 
 from iif_core.camera.response import Response, response, sampled_response
 from iif_core.errors import InputError
+from iif_core.light.base_scene import BaseScene, Light
 from iif_core.reflectance.material import CHANNELS, IDENTITY, apply_affines
 from workflow.artifacts.store import StageReader
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import BaseScene, Light, read_base, read_lit_scene
+from workflow.scene.base_scene import read_base, read_lit_scene
 
 
 @dataclass(frozen=True)

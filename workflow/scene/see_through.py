@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from iif_core.light.base_scene import BaseScene
 from iif_core.light.emission.translucent import TRANSMITTANCE, is_brighter_where_open
 from workflow.runtime import device
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import BaseScene
 from workflow.scene.emission_pixels import Photographs, ViewRecord, ViewRecords
 from workflow.scene.normal_form import View
 

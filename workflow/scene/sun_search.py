@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from iif_core.camera.pixels import ViewPixels
 from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.environment import Sky
 from iif_core.light.emission.groups import EmitterGroups
@@ -30,7 +31,6 @@ from iif_core.light.emission.sun import (
 from iif_core.light.environment import direction_in, solid_angles
 from iif_core.numerics.xp import NUMPY
 from workflow.decisions import light as decisions
-from workflow.scene.base_scene import ViewPixels
 from workflow.scene.emission_pixels import SEEDS, Photographs, choose_rows, radiance_cache
 from workflow.scene.emission_solve import base_albedo, believed_metallic, comparison_tile, light_prior, trace_rows
 

@@ -20,6 +20,7 @@ from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, SgdOptio
 from iif_core.fitting.published import PublishedOptions, PublishedState, fit_published
 from iif_core.fitting.reference_loss import reference_loss
 from iif_core.fitting.sgd import fit_affines_sgd
+from iif_core.light.base_scene import BaseScene
 from iif_core.reflectance.material import CHANNELS, NUMBERS_OF, apply_affines
 from workflow.artifacts.scratch import Joined
 from workflow.artifacts.store import ids_from_disk, split_rgb
@@ -30,15 +31,7 @@ from workflow.fitting.cell_textures import CellTextures
 from workflow.fitting.fit_pixels import FitPixels, count_eligible
 from workflow.fitting.inputs import balanced, cells_of, exposure_and_balance, roughness_levels
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import (
-    BaseScene,
-    base_maps,
-    read_base,
-    read_gains,
-    read_lit_scene,
-    sensor_bounds,
-    view_pixels,
-)
+from workflow.scene.base_scene import base_maps, read_base, read_gains, read_lit_scene, sensor_bounds, view_pixels
 from workflow.scene.cached_light import has_lobes, read_diffuse, read_specular
 from workflow.scene.named import object_number
 from workflow.scene.normal_form import CaptureReader

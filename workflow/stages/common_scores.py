@@ -11,11 +11,12 @@ from iif_core.camera.pinhole import direction_derivatives
 from iif_core.errors import InputError
 from iif_core.evaluation import metrics
 from iif_core.evaluation.consistency import held_out_gain
+from iif_core.light.base_scene import BaseScene
 from iif_core.reflectance.material import PROPERTIES
 from iif_core.surface.lookup import values_at
 from workflow.models.denoise import denoise
+from workflow.runtime import device
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import BaseScene
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import Recovered, read_recovered, read_response
 from workflow.scoring import scores as scoring
@@ -98,6 +99,7 @@ class _Renderer:
     def __init__(self, job: Job, scene: Recovered, shared: CaptureReader):
         self._surface, self._shared, self._seed = scene.surface, shared, job.seed
         self._curve = read_response(job.read("affines"))
+        device.mitsuba()
         geometry, material = scene.surface.traceable(scene.light.emits)
         from iif_core.light.transport.scene import Scene
 

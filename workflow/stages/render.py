@@ -7,14 +7,16 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from iif_core.camera.pinhole import direction_derivatives, pixel_directions
+from iif_core.camera.pixels import pixel_gains
 from iif_core.errors import InputError
 from iif_core.evaluation.consistency import held_out_gain
 from iif_core.reflectance.material import BLACK
 from workflow.artifacts.store import rgb, split_rgb
 from workflow.decisions import light as decisions
 from workflow.models.denoise import denoise, require_denoiser
+from workflow.runtime import device
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import pixel_gains, read_gains, read_radiance_cache
+from workflow.scene.base_scene import read_gains, read_radiance_cache
 from workflow.scene.cached_light import has_lobes
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.picture_facts import view_attributes
@@ -33,6 +35,7 @@ def run(job: Job) -> None:
     """
     capture, scene = CaptureReader(job.read("capture")), read_recovered(job)
     curve, gains = read_response(job.read("affines")), read_gains(job)
+    device.mitsuba()
     geometry, material = scene.surface.traceable(scene.light.emits)
     from iif_core.light.transport.render import render
     from iif_core.light.transport.scene import PathOptions, Scene

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from iif_core.camera.pixels import ViewPixels
 from iif_core.errors import InputError
+from iif_core.light.base_scene import BaseScene
 from iif_core.reflectance.directional_albedo import uniform_lobes
 from iif_core.reflectance.material import MATTE_ROUGHNESS
 from iif_core.surface.cells import grid_origin
@@ -19,15 +21,9 @@ from workflow.decisions.materials import METALLIC_PRIOR
 from workflow.decisions.plan import included, matte_by_predictions
 from workflow.decisions.record import PROVISIONAL, Decision
 from workflow.fitting.fit_pixels import FitPixels, count_eligible
+from workflow.runtime import device
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import (
-    BaseScene,
-    ViewPixels,
-    read_lit_scene,
-    read_object_gains,
-    read_radiance_cache,
-    view_pixels,
-)
+from workflow.scene.base_scene import read_lit_scene, read_object_gains, read_radiance_cache, view_pixels
 from workflow.scene.cached_light import UNITS, SpecularLight, table_of
 from workflow.scene.normal_form import CaptureReader, View
 
@@ -67,6 +63,7 @@ def run(job: Job) -> None:
     cells, counts = _cells(job, capture, scene, mixed)
     pixels = job.settings.shading.pixels
     drawn = None if pixels == "all" else FitPixels.evenly(counts, int(pixels), mixed, job.seed)
+    device.mitsuba()
     # Surface outside all photographs is given the object gains that stage emission found.
     geometry, material = scene.with_gains(read_object_gains(job, scene.n_objects)).traceable(light.emits)
     cache = read_radiance_cache(job)
