@@ -10,6 +10,7 @@ from iif_core.light.emission.sun import (
     FINER,
     RADII,
     Disc,
+    SunEvidence,
     SunQuestion,
     around,
     direct_light,
@@ -172,13 +173,13 @@ def test_the_smallest_disc_that_is_as_good(decreases, number, narrow):
 
 def test_decision():
     disc = Disc(np.array([0.0, 0.6, 0.8]), np.radians(4.2), np.arange(9))
-    found = decisions.sun(disc, 0.1, 0.04, 0.9)
+    found = decisions.sun(SunEvidence(disc, 0.1, 0.04, 0.9))
     assert found["included"] and found["value"] == pytest.approx(0.6) and "(0.00, 0.60, 0.80)" in found["reason"]
-    wide, weak = decisions.sun(disc, 0.1, 0.04, 0.6), decisions.sun(disc, 0.1, 0.0951, 1.0)
+    wide, weak = (decisions.sun(SunEvidence(disc, 0.1, with_it, narrow)) for with_it, narrow in ((0.04, 0.6), (0.0951, 1.0)))
     assert not wide["included"] and "bright part of the sky" in wide["reason"]
     assert not weak["included"] and "part of the sky" not in weak["reason"] and "was not found on" in weak["reason"]
-    none = decisions.sun(None, 0.0, 0.0)
-    assert not none["included"] and none["value"] == 0.0 and not decisions.no_place_for_a_sun()["included"]
+    none = decisions.sun(SunEvidence(None, 0.0, 0.0))
+    assert not none["included"] and none["value"] == 0.0 and not decisions.sun(None)["included"]
 
 
 @pytest.mark.parametrize(

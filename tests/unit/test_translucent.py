@@ -145,16 +145,16 @@ def test_units_do_not_matter(unit, ratio):
 
 def test_sheets_on_a_ray(llvm):
     """Two sides of one cloth half a millimetre apart count twice, as paths meet them; a ray that misses them counts once."""
-    from workflow.scene.see_through import _Behind
+    from iif_core.light.tracer import Behind
 
     levels = (0.0, 1.0, 1.0005, 1.6)
     parts = [quad((-1, -1, z), (2, 0, 0), (0, 2, 0)) for z in levels]
     vertices, faces = np.concatenate([v for v, _ in parts]), np.concatenate([f + 4 * i for i, (_, f) in enumerate(parts)])
     scene = SimpleNamespace(vertices=vertices, faces=faces, object_id=np.repeat(np.arange(4), 2))
-    behind = _Behind(scene, np.repeat([False, True, True, True], 2))
-    view = SimpleNamespace(world_from_camera=np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2.0], [0, 0, 0, 1]]))
+    behind = Behind(scene, np.repeat([False, True, True, True], 2))
+    eye = np.array([0.0, 0.0, 2.0])
     towards = np.array([[0.0, 0.1, -1.0], [0.1, 0.0, 1.0], [0.0, 1.3, -1.0]])
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    assert behind.sheets(view, towards).tolist() == [3, 1, 1]
-    assert behind.is_open(view, towards).tolist() == [False, True, True]
-    assert behind.sheets(view, towards[:0]).tolist() == []
+    assert behind.sheets(eye, towards).tolist() == [3, 1, 1]
+    assert behind.is_open(eye, towards).tolist() == [False, True, True]
+    assert behind.sheets(eye, towards[:0]).tolist() == []

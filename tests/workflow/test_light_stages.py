@@ -14,7 +14,7 @@ from lab.simulated.photographs import response_curve
 from tests.errors import refused
 from workflow.artifacts import files
 from workflow.registry import STAGES
-from workflow.scene import emission_pixels
+from workflow.scene import emission_views
 from workflow.scene.base_scene import read_base_scene
 from workflow.scene.cached_light import read_diffuse, read_specular
 from workflow.scene.normal_form import CaptureReader
@@ -97,7 +97,7 @@ def test_faces_between_the_chosen_pixels_are_seen(hdr):
     job = StubJob("reader", folder, {"emission": {**EMISSION, "pixels": 1000}, "capture": {}, "affines": AFFINES})
     job.stage = STAGES["emission"]
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
-    records = emission_pixels.ViewRecords(job, capture, scene)
+    records = emission_views.ViewRecords(job, capture, scene)
     of_pixels, seen = set(), set()
     for view in capture.views:
         record = records[view]
@@ -217,7 +217,7 @@ def _emission_reading_files(folder, monkeypatch, budget):
 
     with monkeypatch.context() as patch:
         patch.setattr(files, "read_exr", counted)
-        patch.setattr(emission_pixels, "VIEW_MEMORY_MB", budget)
+        patch.setattr(emission_views, "VIEW_MEMORY_MB", budget)
         _run(folder, "ldr", upto="emission")
     return {name: facts["sha256"] for name, facts in _reader(folder, "emission").manifest["files"].items()}, reads
 
@@ -226,7 +226,7 @@ def test_each_view_is_decoded_once_within_the_memory_budget(tmp_path, llvm, monk
     """Photograph, G-buffer, segmentation and base maps of a view are read once; without memory the result is the same."""
     exposures = np.array([0.5, 1.0, 2.0, 1.0])
     build(tmp_path, views=4, size=32, samples=32, dynamic_range="ldr", curve="filmic", exposures=exposures)
-    written, reads = _emission_reading_files(tmp_path, monkeypatch, emission_pixels.VIEW_MEMORY_MB)
+    written, reads = _emission_reading_files(tmp_path, monkeypatch, emission_views.VIEW_MEMORY_MB)
     assert len(reads) == 4 and max(reads.values()) <= 4
     again, more = _emission_reading_files(tmp_path, monkeypatch, 0.0)
     assert again == written and min(more.values()) > 4

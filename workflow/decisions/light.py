@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from iif_core.light.emission.search import STEP
-from iif_core.light.emission.sun import SHARP, Disc, is_needed
+from iif_core.light.emission.sun import SHARP, SunEvidence
 from iif_core.light.emission.translucent import TRANSMITTANCE
 from workflow.decisions.plan import CACHE_COVERAGE, ESCAPE_BRIGHTNESS
 from workflow.decisions.record import FORCED, SETTLED, Decision, decision
@@ -51,31 +51,25 @@ def environment(setting: str, primary_escape: float, secondary_escape: float, re
 _SUN = "share by which the misfit falls with a sun"
 
 
-def sun(disc: Disc | None, without: float, with_it: float, narrow: float = 0.0) -> Decision:
+def sun(found: SunEvidence | None) -> Decision:
     """Decide about a sun that no camera sees (docs/method/light.md#the-sun).
 
     Args:
-        disc: that explains the photographs best; None = no single direction helps.
-        without, with_it: misfit of the light (Eq. L.40) without a sun and with the disc; of held-out views, if the disc is sharp.
-        narrow: share of what the best disc takes off the misfit that a narrow one does.
+        found: what speaks for it; None = cameras see light from outside in all directions, unsaturated.
     """
-    value = 1.0 - with_it / without if 0 < without < np.inf else 0.0
-    included = disc is not None and is_needed(without, with_it) and narrow >= SHARP
-    reason = f"misfit {without:.4f}, and {with_it:.4f} with the best sun"
-    if disc is not None:
-        towards, size = ", ".join(f"{x:.2f}" for x in disc.direction), np.degrees(disc.radius)
+    if found is None:
+        return decision("sun", False, _SUN, 0.0, STEP, "cameras see the whole outside unsaturated")
+    value = 1.0 - found.with_it / found.without if 0 < found.without < np.inf else 0.0
+    reason = f"misfit {found.without:.4f}, and {found.with_it:.4f} with the best sun"
+    if found.disc is not None:
+        towards, size = ", ".join(f"{x:.2f}" for x in found.disc.direction), np.degrees(found.disc.radius)
         reason += f", towards ({towards}), {f'a disc of radius {size:.1f} degrees' if size else 'one texel'}"
-        sharp = f"a narrow one does {narrow:.0%} of what the best one does"
-        if narrow < SHARP:
+        sharp = f"a narrow one does {found.narrow:.0%} of what the best one does"
+        if found.narrow < SHARP:
             reason += f"; {sharp}, so that it is a bright part of the sky"
         else:
             reason += f", on views that its radiance was not found on; {sharp}"
-    return decision("sun", included, _SUN, value, STEP, reason)
-
-
-def no_place_for_a_sun() -> Decision:
-    """Cameras see light from outside in all directions, unsaturated."""
-    return decision("sun", False, _SUN, 0.0, STEP, "cameras see the whole outside unsaturated")
+    return decision("sun", found.is_sun, _SUN, value, STEP, reason)
 
 
 def emitters(groups: int, dropped: int, candidates: int) -> Decision:

@@ -30,7 +30,7 @@ from workflow.decisions import light as decisions
 from workflow.runtime import device
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_base_scene, view_pixels
-from workflow.scene.emission_pixels import gain_plan, view_exposures
+from workflow.scene.emission_views import gain_plan, view_exposures
 from workflow.scene.light_files import emitter_columns, write_light
 from workflow.scene.normal_form import CaptureReader, View
 

@@ -201,3 +201,24 @@ def size_of_sun(decreases: np.ndarray) -> SunSize:
 def is_needed(without: float, with_it: float) -> bool:
     """The misfit falls by more than `STEP`; one below zero, which noise of the traces can make, cannot fall."""
     return without > 0 and with_it < (1.0 - STEP) * without
+
+
+@dataclass(frozen=True)
+class SunEvidence:
+    """What speaks for a sun that no camera sees.
+
+    Attributes:
+        disc: that explains the photographs best; None = no single direction helps.
+        without, with_it: misfit of the light (Eq. L.40) without a sun and with the disc; of held-out views, if the disc is sharp.
+        narrow: share of what the best disc takes off the misfit that a narrow one does.
+    """
+
+    disc: Disc | None
+    without: float
+    with_it: float
+    narrow: float = 0.0
+
+    @property
+    def is_sun(self) -> bool:
+        """The photographs are explained clearly better, and by a narrow disc."""
+        return self.disc is not None and is_needed(self.without, self.with_it) and self.narrow >= SHARP

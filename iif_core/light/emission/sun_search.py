@@ -9,8 +9,10 @@ import numpy as np
 
 from iif_core.camera.pixels import ViewPixels
 from iif_core.light.emission.cache import RadianceVoxels
+from iif_core.light.emission.emitters import base_albedo, believed_metallic, comparison_tile, light_prior, trace_rows
 from iif_core.light.emission.environment import Sky
 from iif_core.light.emission.groups import EmitterGroups
+from iif_core.light.emission.photographs import SEEDS, Photographs, choose_rows, radiance_cache
 from iif_core.light.emission.pixels import TILE_PIXELS, EmissionPixels
 from iif_core.light.emission.problem import assemble
 from iif_core.light.emission.rows import TracedTransport
@@ -18,6 +20,7 @@ from iif_core.light.emission.sun import (
     FINER,
     RADII,
     Disc,
+    SunEvidence,
     SunQuestion,
     around,
     direct_light,
@@ -30,9 +33,6 @@ from iif_core.light.emission.sun import (
 )
 from iif_core.light.environment import direction_in, solid_angles
 from iif_core.numerics.xp import NUMPY
-from workflow.decisions import light as decisions
-from workflow.scene.emission_pixels import SEEDS, Photographs, choose_rows, radiance_cache
-from workflow.scene.emission_solve import base_albedo, believed_metallic, comparison_tile, light_prior, trace_rows
 
 ROWS = 8_000
 """Pixels from which the place and the size of the sun are found."""
@@ -40,14 +40,15 @@ FIRST_ROWS = 5_000
 """Pixels from which the texel of the sun is found."""
 
 
-def find_sun(photos: Photographs, sky: Sky, threshold: float) -> tuple[Sky, decisions.Decision]:
-    """Return the sky with a sun, if the photographs are explained clearly better by one, and what was decided.
+def find_sun(photos: Photographs, sky: Sky, threshold: float) -> tuple[Sky, SunEvidence | None]:
+    """Return the sky with a sun, if the photographs are explained clearly better by one, and what speaks for it; None = cameras
+    see light from outside in all directions, unsaturated.
 
     threshold: radiance from which surface is a candidate for an emitter. Here all surface reflects.
     """
     texels = sun_texels(sky)
     if not len(texels):
-        return sky, decisions.no_place_for_a_sun()
+        return sky, None
     height, width = sky.columns.shape
     cache = radiance_cache(photos, EmitterGroups.none(len(photos.scene.faces)))
     coarse = _Rows.traced(photos, sky, cache, threshold, comparison_tile(photos), FIRST_ROWS)
@@ -56,9 +57,9 @@ def find_sun(photos: Photographs, sky: Sky, threshold: float) -> tuple[Sky, deci
     promising = question.decrease([np.array([i]) for i in range(len(texels))], none).argmax()
     found = question.look(np.array([promising]))
     if not is_needed(none.misfit, found.misfit):
-        return sky, decisions.sun(None, none.misfit, found.misfit)
+        return sky, SunEvidence(None, none.misfit, found.misfit)
     texel = int(texels[promising])
-    photos.job.log.info("is there a sun? misfit %.4f instead of %.4f", found.misfit, none.misfit)
+    photos.log.say(f"is there a sun? misfit {found.misfit:.4f} instead of {none.misfit:.4f}")
     # Which disc it is shows at the borders of what it lights: small tiles.
     fine = _Rows.traced(photos, sky, cache, threshold, TILE_PIXELS, ROWS)
     near = around(sky, texel)
@@ -71,9 +72,9 @@ def find_sun(photos: Photographs, sky: Sky, threshold: float) -> tuple[Sky, deci
     disc = shapes[best * len(RADII) + size.number]
     disc = disc._replace(texels=near[disc.texels])
     if not size.is_sharp:
-        return sky, decisions.sun(disc, none.misfit, found.misfit, size.narrow)
-    decision = decisions.sun(disc, *fine.held_out(disc), size.narrow)
-    return (with_sun(sky, disc) if decision["included"] else sky), decision
+        return sky, SunEvidence(disc, none.misfit, found.misfit, size.narrow)
+    evidence = SunEvidence(disc, *fine.held_out(disc), size.narrow)
+    return (with_sun(sky, disc) if evidence.is_sun else sky), evidence
 
 
 def _members(texel: int, height: int, width: int) -> np.ndarray:
@@ -101,7 +102,7 @@ class _Rows:
     def traced(cls, photos: Photographs, sky: Sky, cache: RadianceVoxels, threshold: float, tile_edge: int, rows: int) -> _Rows:
         """Trace `rows` pixels, to be averaged in tiles; the cache covers all surface."""
         none = EmitterGroups.none(len(photos.scene.faces))
-        thin = -(-photos.job.settings.emission.rows // rows)
+        thin = -(-photos.options.rows // rows)
         pixels, base, shown = choose_rows(photos, none, threshold, thin, tile_edge)
         transport = trace_rows(photos, pixels, base, none, cache, sky, 4)
         return cls(photos, sky, _Points(pixels, base, shown), transport.without_lobes())
@@ -139,13 +140,11 @@ class _Rows:
 
     def _direct(self, texels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
         """(2, n, T, 3) what the points reflect of each texel directly, twice with one ray into each."""
-        from iif_core.light.transport.geometry import trace
-
         pixels, base = self.points.pixels, self.points.base
         normal = pixels.normals.astype(np.float64)
         start, count = pixels.points + 1e-3 * normal, len(normal)
         albedo = base[:, :3] * (1.0 - believed_metallic(base))[:, None]
-        solid, rng = solid_angles(*shape).ravel()[texels], np.random.default_rng([self.photos.job.seed, SEEDS, 4])
+        solid, rng = solid_angles(*shape).ravel()[texels], np.random.default_rng([self.photos.options.seed, SEEDS, 4])
         out = np.zeros((2, count, len(texels), 3), np.float32)
         for half in range(2):
             for i, texel in enumerate(texels):
@@ -154,7 +153,7 @@ class _Rows:
                 cosine, escapes = (way * normal).sum(1), np.zeros(count, bool)
                 up = np.flatnonzero(cosine > 0)
                 if len(up):
-                    escapes[up] = trace(self.photos.world[0], start[up], way[up])[0] < 0
+                    escapes[up] = self.photos.tracer.meets(start[up], way[up])[0] < 0
                 out[half, :, i] = direct_light(albedo, cosine[:, None], escapes[:, None], solid[i : i + 1])[:, 0]
-            self.photos.job.progress(half + 1, 2, "halves of the rays towards the sun traced")
+            self.photos.log.progress(half + 1, 2, "halves of the rays towards the sun traced")
         return out

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, BaseAlbedo, GainOpt
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.hidden import with_hidden_surface
 from iif_core.light.emission.loss import reference_loss
+from iif_core.light.emission.photographs import SEEDS, Photographs, choose_rows, joined, radiance_cache, seen_faces
 from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import (
     EmissionProblem,
@@ -38,11 +39,8 @@ from iif_core.light.emission.pruning import PrunedEmission, WhiteSurface, insign
 from iif_core.light.emission.rows import TracedTransport, light_of
 from iif_core.light.emission.search import HIDDEN_EXCESS, QUICK, Candidates, Families, search
 from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
+from iif_core.light.tracer import Tracer
 from iif_core.surface.cells import pack_keys, voxel_indices
-from workflow.scene.emission_pixels import SEEDS, Photographs, choose_rows, joined, radiance_cache, seen_faces
-
-if TYPE_CHECKING:
-    from iif_core.light.transport.materials import CellMaterials
 
 WHITE = (1.0, 1.0, 1.0, 1.0, 0.0)
 """Material of the brightest surface that only reflects."""
@@ -122,13 +120,13 @@ def trial(
     tried, gains = problem.solve_object_gains(prior, base_albedo(photos, sky), photos.scene.n_objects)
     family, protected = _families(photos, groups, n_groups), np.arange(n_groups) >= groups.size
     evidence = white_surface(rows, np.concatenate([seen, np.zeros((n_groups - groups.size, 3))]), white)
-    share = photos.job.settings.emission.prune
+    share = photos.options.prune
     return prune_groups(tried.rows, prior, family, evidence, ~tried.anchor, protected, share, certain), reliable(gains)
 
 
 def traced(
     photos: Photographs,
-    unseen: CellMaterials,
+    unseen: Tracer,
     groups: EmitterGroups,
     sky: Sky | None,
     threshold: float,
@@ -139,7 +137,7 @@ def traced(
 ) -> Traced:
     """Trace the rows of groups that emit light, and estimate the gains of objects under it.
 
-    unseen: materials of surface that paths meet and no photograph shows, with the gains of the trial; `tile_edge` and `options`
+    unseen: paints what paths meet and no photograph shows, with the gains of the trial; `tile_edge` and `options`
     as in `choose_rows` and `solve_object_gains`; voxels: None = of the photographs; left_out: (F,) bool, faces whose pixels are
     no rows unless they shine.
     """
@@ -157,7 +155,7 @@ def traced(
 
 def search_emitters(
     photos: Photographs,
-    unseen: CellMaterials,
+    unseen: Tracer,
     groups: EmitterGroups,
     pruned: PrunedEmission,
     certain: float,
@@ -173,7 +171,7 @@ def search_emitters(
     Returns the problem of the emitters, which of `groups` are among them, and a description of what was changed.
     """
     # Groups were dropped one after the other; of some the light was given to others, and they may be needed after all.
-    offered = np.flatnonzero(pruned.may_shine(certain, photos.job.settings.emission.prune)[: groups.size])
+    offered = np.flatnonzero(pruned.may_shine(certain, photos.options.prune)[: groups.size])
     lit, excess, power = (of_group[offered] for of_group in (pruned.kept, pruned.excess, pruned.power))
     groups, all_groups = groups.select(np.isin(np.arange(groups.size), offered)), groups.size
     scene = photos.scene
@@ -219,7 +217,7 @@ def search_emitters(
 
 
 def solve_with_saturated_surface(
-    photos: Photographs, unseen: CellMaterials, found: Traced, sky: Sky | None, threshold: float
+    photos: Photographs, unseen: Tracer, found: Traced, sky: Sky | None, threshold: float
 ) -> tuple[Traced, EmissionSolution, float]:
     """Solve, and solve once more if saturated surface that only reflects turns out to be much brighter than its bound.
 
@@ -233,7 +231,7 @@ def solve_with_saturated_surface(
         if not _differs(cache, found.cache, SATURATED_SHARE):
             break
         more = float(cache.radiance.sum()) / max(float(bounds.radiance.sum()), 1e-300) - 1.0
-        photos.job.log.info("saturated surface adds %.0f %% to the cached light", 100 * more)
+        photos.log.say(f"saturated surface adds {100 * more:.0f} % to the cached light")
         found = traced(photos, unseen, found.groups, sky, threshold, voxels=cache)
         solution, loss = solve(photos, found, sky)
     return found, solution, loss
@@ -253,7 +251,7 @@ def _differs(cache: RadianceVoxels, before: RadianceVoxels, share: float) -> boo
 
 
 def _raised(
-    photos: Photographs, unseen: CellMaterials, found: Traced, cache: RadianceVoxels, radiance: np.ndarray, sky: Sky | None
+    photos: Photographs, unseen: Tracer, found: Traced, cache: RadianceVoxels, radiance: np.ndarray, sky: Sky | None
 ) -> RadianceVoxels:
     """The cache of the photographs, with its bounds raised to what surface reflects of the light `radiance` (G, 3)."""
     bounds = pack_keys(cache.ijk[cache.censored])
@@ -263,7 +261,7 @@ def _raised(
     for view in photos.views:
         record = photos.records[view]
         pixels = record.pixels
-        drawn = np.random.default_rng([photos.job.seed, SEEDS, 2, view.view_id]).random(len(pixels.index))
+        drawn = np.random.default_rng([photos.options.seed, SEEDS, 2, view.view_id]).random(len(pixels.index))
         use = np.flatnonzero(pixels.valid & pixels.interior & (found.groups.of_face[pixels.face] < 0))
         keys = pack_keys(voxel_indices(pixels.points[use], cache.edge, cache.origin))
         inside = np.flatnonzero(np.isin(keys, bounds))
@@ -285,7 +283,7 @@ def _raised(
 
 def _first_look(
     photos: Photographs,
-    unseen: CellMaterials,
+    unseen: Tracer,
     every: EmitterGroups,
     lit: np.ndarray,
     family: np.ndarray,
@@ -293,7 +291,7 @@ def _first_look(
     threshold: float,
 ) -> Candidates:
     """Trace all groups as columns of one problem, on some of the rows; of the first groups some are `lit`."""
-    thin = -(-photos.job.settings.emission.rows // FIRST_LOOK_ROWS)
+    thin = -(-photos.options.rows // FIRST_LOOK_ROWS)
     cache = radiance_cache(photos, every)
     pixels, base, rows = choose_rows(photos, every, threshold, thin, comparison_tile(photos))
     transport = trace_rows(photos, pixels, base, every, cache, sky, 2, unseen)
@@ -310,10 +308,10 @@ def _first_look(
 
 
 def _white_hidden_surface(
-    photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, unseen: CellMaterials
+    photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, unseen: Tracer
 ) -> WhiteSurface:
     """What both sides together of each hidden group would show if they were white; nothing for the other groups."""
-    scene, rng = photos.scene, np.random.default_rng([photos.job.seed, SEEDS, 3])
+    scene, rng = photos.scene, np.random.default_rng([photos.options.seed, SEEDS, 3])
     number = groups.size + (sky.size if sky else 0)
     matrix, cached = np.zeros((number, number, 3)), np.zeros((number, 3))
     own = np.flatnonzero(groups.is_hidden)
@@ -341,8 +339,7 @@ def _names(photos: Photographs, groups: EmitterGroups, family: np.ndarray, numbe
     """Describe a family: its object, and whether a camera sees it."""
     own = np.flatnonzero(family == number)
     thing = int(photos.scene.object_id[np.flatnonzero(groups.of_face == own[0])[0]])
-    table = photos.job.read("segmentation").table("objects.parquet")
-    name = dict(zip(table["object_id"].tolist(), table["name"].tolist(), strict=True)).get(thing, "surface of no object")
+    name = photos.names[thing] if thing >= 0 else "surface of no object"
     unseen = "unseen " if groups.is_hidden[own[0]] else ""
     return f"{unseen}{name} ({groups.area[own].sum():.2g} m^2)"
 
@@ -357,11 +354,11 @@ def solve(photos: Photographs, found: Traced, sky: Sky | None) -> tuple[Emission
         outside = np.arange(found.groups.size, len(initial))
         together = outside if sky.sun is None else np.delete(outside, sky.sun)  # a sun is not like the sky around it
         family[together], width[together] = -1 - len(initial), OUTSIDE_WIDTH
-    settings = photos.job.settings.emission
+    settings = photos.options
     if settings.solver == "sgd":
         # Which groups emit is known by now, so `safe` has nothing to prune.
         prune = ((100, 0.0), (1000, 0.05)) if settings.preset == "paper" else ()
-        options = SgdOptions(settings.preset, settings.iterations or SgdOptions.steps, prune=prune, seed=photos.job.seed)
+        options = SgdOptions(settings.preset, settings.iterations or SgdOptions.steps, prune=prune, seed=settings.seed)
         solution = solve_emission_sgd(problem.rows, initial, options)
     else:
         solution = solve_families(problem.rows, prior, family, width)
@@ -413,19 +410,16 @@ def trace_rows(
     voxels: RadianceVoxels,
     sky: Sky | None,
     stream: int,
-    unseen: CellMaterials | None = None,
+    unseen: Tracer | None = None,
 ) -> TracedTransport:
     """Return two independent estimates of (A, h), by lobe.
 
-    unseen: materials of surface that paths meet and no photograph shows; None = the base texture."""
-    job, settings = photos.job, photos.job.settings.emission
-    geometry, material = photos.world
+    unseen: paints what paths meet and no photograph shows; None = the base texture."""
     from iif_core.light.transport.cache import RadianceCache
-    from iif_core.light.transport.matrix import transport_matrix
-    from iif_core.light.transport.scene import EmitterColumns, PathOptions, Scene, ShadingPoints
+    from iif_core.light.transport.scene import EmitterColumns, PathOptions, ShadingPoints
 
+    options = photos.options
     cache = RadianceCache(voxels.edge, voxels.origin, voxels.ijk, voxels.radiance)
-    scene = Scene(geometry, material if unseen is None else unseen, None, cache)
     metallic = believed_metallic(base)
     points = ShadingPoints(pixels.points, pixels.normals, pixels.wo, base[:, :3], base[:, 3], metallic)
     side = np.where(groups.of_face >= 0, groups.side, 0).astype(np.int8)
@@ -433,14 +427,13 @@ def trace_rows(
     weight = _drawn(groups, photos.scene.areas)
     columns = EmitterColumns(groups.of_face, groups.size + (sky.size if sky else 0), side, texels, weight)
     drawn = sky.texel_weight if sky else None
-    samples, seed = max(1, settings.samples // 2), ((job.seed << 32) | SEEDS) * 8 + 2 * stream
+    samples, seed = max(1, options.samples // 2), ((options.seed << 32) | SEEDS) * 8 + 2 * stream
+    traces = [PathOptions(samples, options.max_bounces, seed + half) for half in range(2)]
     halves = []
-    for half in range(2):
-        job.progress(half, 2, "halves of the transport matrix traced")
-        paths = PathOptions(samples, settings.max_bounces, seed + half)
-        found = transport_matrix(scene, points, columns, paths, drawn, pixels.number)
+    photos.log.progress(0, 2, "halves of the transport matrix traced")
+    for found in (unseen or photos.tracer).transport(points, columns, cache, traces, drawn, pixels.number):
         halves.append([_albedo_and_gloss(values, metallic == 0) for values in found])
-    job.progress(2, 2, "halves of the transport matrix traced")
+        photos.log.progress(len(halves), 2, "halves of the transport matrix traced")
     return TracedTransport(*(np.stack(part) for part in zip(*halves, strict=True)))
 
 

@@ -1,0 +1,39 @@
+"""What the search for the light of a scene can be told, and where it says what it does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class EmissionOptions:
+    """How the light of a scene is looked for (`workflow/settings/light.py` explains each).
+
+    Attributes:
+        seed: of the random streams.
+        min_observations: pixels that must show a face or a group of faces before it can be an emitter.
+        cache_edge: edge of a voxel of the radiance cache, metres.
+        rows: pixels whose light transport is traced; samples: paths for each, over two halves; max_bounces: their longest.
+        prune: share of the photographed light below which an emitter is dropped, unless it is missed.
+        solver: `direct` or `sgd`; preset, iterations: of `sgd`.
+    """
+
+    seed: int
+    min_observations: int
+    cache_edge: float
+    rows: int
+    samples: int
+    max_bounces: int
+    prune: float
+    solver: str = "direct"
+    preset: str = "safe"
+    iterations: int | None = None
+
+
+@dataclass(frozen=True)
+class Log:
+    """Where a long computation says what it finds: `say(text)`, and how far it is: `progress(done, total, what)`."""
+
+    say: Callable[[str], None] = lambda text: None
+    progress: Callable[[int, int, str], None] = lambda done, total, what: None

@@ -1,0 +1,81 @@
+"""What stage emission reads of a capture: views, decoded once as far as memory allows, and their exposures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from iif_core.camera.gains import CameraGains
+from iif_core.camera.pixels import pixels_of_view
+from iif_core.light.base_scene import BaseScene
+from iif_core.light.emission.photographs import SEEDS, ViewRecord
+from workflow.decisions import camera as decisions
+from workflow.runtime.job import Job
+from workflow.scene.base_scene import base_maps, decode_view
+from workflow.scene.normal_form import CaptureReader, View
+
+VIEW_MEMORY_MB = 1024.0
+"""Megabytes of decoded views that are kept in memory; every pass over the photographs decodes the others again."""
+
+
+class ViewRecords:
+    """Records of views, read from disk once as far as they fit into VIEW_MEMORY_MB.
+
+    Where the photographs have more pixels than `emission.pixels`, a record is of a random choice of those of its view, the same
+    share of every view; nothing but `seen` and `median_depth` is then of the whole view.
+
+    Passes visit the views in the same order, so the first views are kept and the later ones are decoded again.
+    """
+
+    def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene):
+        self.job, self.capture, self.scene = job, capture, scene
+        self.share = min(1.0, job.settings.emission.pixels / max(sum(view.width * view.height for view in capture.used), 1))
+        self._kept: dict[int, ViewRecord] = {}
+        self._megabytes = 0.0
+
+    def __getitem__(self, view: View) -> ViewRecord:
+        record = self._kept.get(view.view_id)
+        if record is None:
+            record = self._decoded(view)
+            if self._megabytes + record.megabytes <= VIEW_MEMORY_MB:
+                self._kept[view.view_id] = record
+                self._megabytes += record.megabytes
+        return record
+
+    def _decoded(self, view: View) -> ViewRecord:
+        decoded, among, seen = decode_view(self.job, self.capture, view), None, None
+        if self.share < 1:
+            rng = np.random.default_rng([self.job.seed, SEEDS, 5, view.view_id])
+            among = rng.random(decoded.face.size) < self.share
+            shown = decoded.valid & (decoded.face >= 0) & (decoded.depth > 0) & np.isfinite(decoded.photo).all(-1)
+            seen = np.unique(decoded.face[shown])
+        pixels = pixels_of_view(view, decoded, self.scene.normals, among)
+        base = np.zeros((0, 5), np.float32) if view.split == "test" else base_maps(self.job, view)[pixels.index]
+        values = decoded.photo.reshape(-1, 3)
+        counted = decoded.valid.ravel() if among is None else decoded.valid.ravel() & among
+        out = counted & np.isfinite(values).all(1)
+        out[pixels.index] = False
+        direction = view.directions().reshape(-1, 3)[out]
+        deep = decoded.depth[decoded.depth > 0]
+        median = np.median(deep) if deep.size else None
+        outside = np.flatnonzero(out), values[out], direction, np.ones(int(out.sum()), np.float32)
+        return ViewRecord(pixels, base, median, int(counted.sum()), *outside, seen)
+
+
+def view_exposures(capture: CaptureReader, notes: list[str]) -> CameraGains:
+    """Return the exposures of the views as the source knows them."""
+    exposures = capture.exposures()
+    bad = [view.name for view in capture.views if not 0 < view.exposure < np.inf]
+    if bad:  # docs/method/numerics.md#exposure-at-zero
+        notes.append(f"exposure not positive, taken as 1: {', '.join(bad)}")
+        exposures = np.where((exposures > 0) & (exposures < np.inf), exposures, 1.0)
+    return CameraGains.plain(exposures)
+
+
+def gain_plan(capture: CaptureReader, gains: CameraGains) -> list[decisions.Decision]:
+    """Return the decisions about exposure, white balance and vignetting."""
+    if not capture.facts.get("exposure_estimated"):
+        return [decisions.exposure("given", np.zeros(0), 0)]
+    found = [decisions.exposure("estimate", np.log(gains.exposure), int(gains.estimated.sum()))]
+    for term, evidence in gains.evidence.items():
+        found.append(decisions.camera_term(term, evidence))
+    return found
