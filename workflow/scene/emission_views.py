@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from iif_core.camera.gains import CameraGains
-from iif_core.camera.pixels import pixels_of_view
 from iif_core.light.base_scene import BaseScene
 from iif_core.light.emission.photographs import SEEDS, ViewRecord
 from workflow.decisions import camera as decisions
@@ -42,23 +41,12 @@ class ViewRecords:
         return record
 
     def _decoded(self, view: View) -> ViewRecord:
-        decoded, among, seen = decode_view(self.job, self.capture, view), None, None
+        among = None
         if self.share < 1:
             rng = np.random.default_rng([self.job.seed, SEEDS, 5, view.view_id])
-            among = rng.random(decoded.face.size) < self.share
-            shown = decoded.valid & (decoded.face >= 0) & (decoded.depth > 0) & np.isfinite(decoded.photo).all(-1)
-            seen = np.unique(decoded.face[shown])
-        pixels = pixels_of_view(view, decoded, self.scene.normals, among)
-        base = np.zeros((0, 5), np.float32) if view.split == "test" else base_maps(self.job, view)[pixels.index]
-        values = decoded.photo.reshape(-1, 3)
-        counted = decoded.valid.ravel() if among is None else decoded.valid.ravel() & among
-        out = counted & np.isfinite(values).all(1)
-        out[pixels.index] = False
-        direction = view.directions().reshape(-1, 3)[out]
-        deep = decoded.depth[decoded.depth > 0]
-        median = np.median(deep) if deep.size else None
-        outside = np.flatnonzero(out), values[out], direction, np.ones(int(out.sum()), np.float32)
-        return ViewRecord(pixels, base, median, int(counted.sum()), *outside, seen)
+            among = rng.random((view.height, view.width)) < self.share
+        base = None if view.split == "test" else base_maps(self.job, view)
+        return ViewRecord.of(view, decode_view(self.job, self.capture, view), self.scene.normals, base, among)
 
 
 def view_exposures(capture: CaptureReader, notes: list[str]) -> CameraGains:

@@ -12,7 +12,7 @@ import numpy as np
 
 from iif_core.camera.gains import CameraGains
 from iif_core.camera.pinhole import direction_derivatives
-from iif_core.camera.pixels import ViewPixels, pixel_gains
+from iif_core.camera.pixels import DecodedView, ViewPixels, pixel_gains, pixels_of_view
 from iif_core.camera.view import View
 from iif_core.light.base_scene import BaseScene, cache_origin
 from iif_core.light.emission.cache import RadianceVoxels, VoxelPixels
@@ -61,6 +61,43 @@ class ViewRecord:
     escaping_direction: np.ndarray
     escaping_share: np.ndarray
     seen: np.ndarray | None = None
+
+    @classmethod
+    def of(
+        cls, view: View, decoded: DecodedView, normals: np.ndarray, base: np.ndarray | None, among: np.ndarray | None = None
+    ) -> ViewRecord:
+        """Collect what is read of a view.
+
+        Args:
+            view: the camera.
+            decoded: photograph, G-buffer and segmentation of the view.
+            normals: (m, 3) of the faces, 0 for degenerate ones.
+            base: (H * W, 5) base albedo, roughness and metallic; None for a held-out view.
+            among: (H, W) bool, pixels that are looked at; None = all.
+        """
+        seen = None
+        if among is not None:
+            shown = decoded.valid & (decoded.face >= 0) & (decoded.depth > 0) & np.isfinite(decoded.photo).all(-1)
+            seen = np.unique(decoded.face[shown])
+            among = among.ravel()
+        pixels = pixels_of_view(view, decoded, normals, among)
+        values = decoded.photo.reshape(-1, 3)
+        counted = decoded.valid.ravel() if among is None else decoded.valid.ravel() & among
+        out = counted & np.isfinite(values).all(1)
+        out[pixels.index] = False
+        direction = view.directions().reshape(-1, 3)[out]
+        deep = decoded.depth[decoded.depth > 0]
+        return cls(
+            pixels=pixels,
+            base=np.zeros((0, 5), np.float32) if base is None else base[pixels.index],
+            median_depth=np.median(deep) if deep.size else None,
+            counted=int(counted.sum()),
+            escaping=np.flatnonzero(out),
+            escaping_value=values[out],
+            escaping_direction=direction,
+            escaping_share=np.ones(int(out.sum()), np.float32),
+            seen=seen,
+        )
 
     @property
     def megabytes(self) -> float:
