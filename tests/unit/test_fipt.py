@@ -152,7 +152,11 @@ def test_fewer_views_keep_their_own_exposures_and_val_may_stay_out(tmp_path):
     synthetic(tmp_path)
     found = fipt.find_inputs(*(document(tmp_path, "ldr", {"views": 3})[key] for key in ("source", "capture")))
     names = [f.name for f in found.transforms.frames]
-    assert names == ["000_0001", "002_0001", "val_001_0001"] and found.gains == (0.5, 2.0, 0.25)
+    assert names == ["000_0001", "002_0001", "val_001_0001"] and [frame.exposure for frame in found.transforms.frames] == [
+        0.5,
+        2.0,
+        0.25,
+    ]
     alone = fipt.find_inputs(*(document(tmp_path, "ldr", validation="none")[key] for key in ("source", "capture")))
     assert [f.split for f in alone.transforms.frames] == [None] * 3  # `capture.test_every` decides
 
@@ -180,7 +184,9 @@ def test_truth_is_all_or_none(tmp_path):
     named(refused(tmp_path), "val/Metallic/001_0001.exr", 1)
     (tmp_path / "val/BaseCol").rename(tmp_path / "val/DiffCol")
     found = fipt.find_inputs(*(document(tmp_path)[key] for key in ("source", "capture")))
-    assert not found.truth and any("no ground truth: BaseCol missing" in note for note in found.transforms.notes)
+    assert not any(frame.truth for frame in found.transforms.frames) and any(
+        "no ground truth: BaseCol missing" in note for note in found.transforms.notes
+    )
 
 
 def test_synthetic_refusals(tmp_path):

@@ -23,6 +23,7 @@ from workflow.runtime.job import Job
 from workflow.sources import folder
 from workflow.sources.folder_scene import images, mesh, transforms
 from workflow.sources.folder_scene.inputs import Inputs
+from workflow.sources.folder_scene.transforms import Entry
 
 OPENCV_FROM_LEFT_UP_FORWARD = np.diag([-1.0, -1.0, 1.0, 1.0])  # from the camera axes of the synthetic scenes
 MAX_COSINE_TO_UP = 2e-3  # between viewing direction and up vector of a real camera
@@ -32,11 +33,12 @@ IDS = {"parts": "IndexMA", "semantic": "segmentation"}
 
 @dataclass
 class Listed:
-    """Cameras as entries of transforms.json, with `_at`: folder and index of the photograph.
+    """Cameras as they are listed.
 
     Attributes:
         path: file of the cameras, for messages.
         entries: one per photograph.
+        at: name of a view -> folder and index of its photograph.
         flip: (4, 4), from OpenCV's camera axes to those of the entries.
         homes: folders of photographs.
         also: further files that were read.
@@ -44,11 +46,20 @@ class Listed:
     """
 
     path: Path
-    entries: list[dict[str, Any]]
     flip: np.ndarray
-    homes: list[Path]
+    entries: list[Entry] = field(default_factory=list)
+    at: dict[str, tuple[Path, int]] = field(default_factory=dict)
+    homes: list[Path] = field(default_factory=list)
     also: list[Path] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+    def add(self, home: Path, place: Path, index: int, encoded: bool, keys: dict[str, Any], split: str | None = None) -> None:
+        """Add photograph `index` of folder `place`, which is in the folder `home` of the scene."""
+        picture = place / "Image" / f"{_file(index)}.{'png' if encoded else 'exr'}"
+        file_path = picture.relative_to(home).as_posix()
+        name = ("val_" if place.name == "val" else "") + _file(index)
+        self.entries.append(Entry(file_path, f"camera {index} ({file_path})", keys, name, split=split))
+        self.at[name] = place, index
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
@@ -78,20 +89,20 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any]) -> Inputs:
             f"{home}: neither train/transforms.json (synthetic) nor cam.txt and K_list.txt (real); `source.path` is the folder"
             " of one FIPT scene"
         )
-    at = {entry["_name"]: entry["_at"] for entry in found.entries}
-    frames = transforms.frames_of(found.path, {}, found.entries, home, source, settings)
-    posed = tuple(replace(f, matrix=f.matrix @ found.flip) for f in frames.frames)
-    gains, response, cam = _sensor(found, [at[f.name] for f in posed]) if encoded else (None, None, [])
-    truth = _truth(found, {f.name: at[f.name] for f in posed})
-    instances, lists = _ids(found, source["ids"], {f.name: at[f.name] for f in posed})
-    frames = replace(frames, frames=posed, axes="opencv", known=True, notes=tuple(found.notes), also=tuple(found.also))
+    listed = transforms.frames_of(found.path, {}, found.entries, home, source, settings)
+    at = {frame.name: found.at[frame.name] for frame in listed.frames}
+    exposures, response, cam = _sensor(found, at) if encoded else ({}, None, [])
+    truth = _truth(found, at)
+    ids, lists = _ids(found, source["ids"], at)
+    frames = tuple(
+        replace(f, matrix=f.matrix @ found.flip, exposure=exposures.get(f.name), ids=ids.get(f.name), truth=truth.get(f.name, {}))
+        for f in listed.frames
+    )
+    listed = replace(listed, frames=frames, axes="opencv", known=True, notes=tuple(found.notes), also=tuple(found.also))
     return Inputs(
-        frames,
+        listed,
         mesh.find(home, source["mesh"]),
-        instances=instances,
-        truth=truth,
         metres=transforms.metres_per_unit(source["unit"]),
-        gains=gains,
         load_ids=partial(load_ids, _listed_ids(lists)),
         response=response,
         also=(*cam, *lists),
@@ -102,19 +113,11 @@ def _file(index: int) -> str:
     return f"{index:03d}_0001"
 
 
-def _entry(home: Path, place: Path, index: int, encoded: bool, **keys: Any) -> dict[str, Any]:
-    prefix = "val_" if place.name == "val" else ""
-    picture = place / "Image" / f"{_file(index)}.{'png' if encoded else 'exr'}"
-    file_path = picture.relative_to(home).as_posix()
-    name = prefix + _file(index)
-    return {"file_path": file_path, "_where": f"camera {index} ({file_path})", "_name": name, "_at": (place, index), **keys}
-
-
 # --------------------------------------------------------------------------------------------------------------- cameras
 
 
 def _synthetic(home: Path, source: dict[str, Any], encoded: bool) -> Listed:
-    found = Listed(home / "train/transforms.json", [], OPENCV_FROM_LEFT_UP_FORWARD, [])
+    found = Listed(home / "train/transforms.json", OPENCV_FROM_LEFT_UP_FORWARD)
     for split in ("train", "val"):
         path = home / split / "transforms.json"
         if split == "val" and (source["validation"] == "none" or not path.is_file()):
@@ -125,20 +128,20 @@ def _synthetic(home: Path, source: dict[str, Any], encoded: bool) -> Listed:
             raise InputError(f"{path}: `frames` must be a list of {{transform_matrix: 4 rows of 4}}, one a photograph")
         if "camera_angle_x" not in document:
             raise InputError(f"{path}: no `camera_angle_x` (radians); FIPT's synthetic scenes have one lens for all views")
-        shared = {"camera_angle_x": document["camera_angle_x"], "_split": "test" if split == "val" else "train"}
+        shared = {"camera_angle_x": document["camera_angle_x"]}
         for i, frame in enumerate(frames):
             keys = {key: frame[key] for key in ("transform_matrix",) if key in frame}
-            found.entries.append(_entry(home, home / split, i, encoded, **shared, **keys))
+            found.add(home, home / split, i, encoded, {**shared, **keys}, "test" if split == "val" else "train")
         found.homes.append(home / split)
         found.also.append(path)
     if len(found.homes) == 1:  # without val/, `capture.test_every` alone decides which views are held out
-        found.entries = [{**entry, "_split": None} for entry in found.entries]
+        found.entries = [replace(entry, split=None) for entry in found.entries]
     return found
 
 
 def _real(home: Path, encoded: bool) -> Listed:
     cameras, lenses = home / "cam.txt", home / "K_list.txt"
-    found = Listed(cameras, [], np.eye(4), [home], [lenses])
+    found = Listed(cameras, np.eye(4), homes=[home], also=[lenses])
     poses, matrices = _triples(cameras, "origin, look-at point, up"), _triples(lenses, "the rows of K")
     if len(poses) != len(matrices):
         raise InputError(f"{lenses}: {len(matrices)} cameras, cam.txt has {len(poses)}; both must list the same photographs")
@@ -147,7 +150,7 @@ def _real(home: Path, encoded: bool) -> Listed:
             raise InputError(f"{lenses}: camera {i}: K = {k.tolist()}; expected fx 0 cx / 0 fy cy / 0 0 1")
         lens = {"fl_x": float(k[0, 0]), "fl_y": float(k[1, 1]), "cx": float(k[0, 2]), "cy": float(k[1, 2])}
         matrix = _looking(cameras, i, *pose).tolist()
-        found.entries.append(_entry(home, home, i, encoded, transform_matrix=matrix, **lens))
+        found.add(home, home, i, encoded, {"transform_matrix": matrix, **lens})
     return found
 
 
@@ -190,8 +193,8 @@ def _looking(path: Path, index: int, origin: np.ndarray, target: np.ndarray, up:
 # ---------------------------------------------------------------------------------------------------------------- sensor
 
 
-def _sensor(found: Listed, used: list[tuple[Path, int]]) -> tuple[tuple[float, ...], np.ndarray | None, list[Path]]:
-    """Read the exposures of the photographs that are used and, where the scene has it, the true response (3, 101).
+def _sensor(found: Listed, at: dict[str, tuple[Path, int]]) -> tuple[dict[str, float], np.ndarray | None, list[Path]]:
+    """Read the exposures of the photographs that are used, by name, and, where the scene has it, the true response (3, 101).
 
     Returns them with the files of both.
     """
@@ -202,20 +205,20 @@ def _sensor(found: Listed, used: list[tuple[Path, int]]) -> tuple[tuple[float, .
             found.notes.append(f"no {path}: exposures are 1")
             continue
         table = _array(path)
-        count = sum(entry["_at"][0] == home for entry in found.entries)
+        count = sum(place == home for place, _ in found.at.values())
         if table.size != count or not (np.isfinite(table).all() and (table > 0).all()):
             raise InputError(f"{path}: {table.size} exposures (smallest {table.min():g}); expected {count} positive numbers")
         tables[home] = table.ravel()
         files.append(path)
-    gains = tuple(float(tables[home][i]) if home in tables else 1.0 for home, i in used)
+    exposures = {name: float(tables[home][i]) if home in tables else 1.0 for name, (home, i) in at.items()}
     path = found.homes[0] / "Image/cam/crf.npy"
     if not path.is_file():
-        return gains, None, files
+        return exposures, None, files
     curve = _array(path)
     if curve.ndim != 2 or curve.shape[0] != 3 or curve.shape[1] < 2 or not np.isfinite(curve).all():
         raise InputError(f"{path}: shape {curve.shape}; expected (3, n) samples of the response, one row a channel")
     even = np.linspace(0, 1, curve.shape[1])
-    return gains, np.stack([np.interp(np.linspace(0, 1, 101), even, row) for row in curve]), [*files, path]
+    return exposures, np.stack([np.interp(np.linspace(0, 1, 101), even, row) for row in curve]), [*files, path]
 
 
 def _array(path: Path) -> np.ndarray:

@@ -81,7 +81,7 @@ class _Capture:
         self.notes += self.mesh.notes
         centres = np.array([pose[:3, 3] for pose in poses])
         mesh.check_size(self.inputs.mesh, self.mesh, getattr(self.source, "unit", "m"), self.metres, centres)
-        if self.mesh.from_nodes and self.inputs.instances:
+        if self.mesh.from_nodes and any(frame.ids for frame in frames):
             self.mesh.instance = self.mesh.names = None
         self._build()
         self.normals = face_geometry(self.mesh.vertices, self.mesh.faces)[0].astype(np.float32)
@@ -134,7 +134,7 @@ class _Capture:
             "plan": found.plan,
             "exposure_estimated": self.settings.exposure == "estimate",
         }
-        has_truth = bool(self.inputs.truth)
+        has_truth = any(frame.truth for frame in frames)
         self.writer.finish(self.source.kind, self.settings.dynamic_range, has_truth, self.notes, self.inputs.response, facts)
         for note in self.notes:
             self.job.log.info("%s", note)
@@ -239,12 +239,12 @@ class _Capture:
         return images.reduce_nearest(ids, view.width, view.height)
 
     def _extras(self, frame: Frame, view: View, photo: np.ndarray, valid: np.ndarray, face: np.ndarray) -> None:
-        if frame.name in self.inputs.instances:
-            self.writer.given_instances(view.name, self._ids(frame, view, self.inputs.instances[frame.name]))
-        if frame.name not in self.inputs.truth:
+        if frame.ids:
+            self.writer.given_instances(view.name, self._ids(frame, view, frame.ids))
+        if not frame.truth:
             return
         maps, known = {}, np.ones(face.shape, bool)
-        for kind, path in self.inputs.truth[frame.name].items():
+        for kind, path in frame.truth.items():
             channels = 1 if kind in ("roughness", "metallic") else 3
             values = images.TURNS[frame.turn](images.load_map(path, channels))
             values = self._upright(frame, path, values.reshape(*values.shape[:2], channels))
@@ -374,8 +374,9 @@ class _Capture:
 
     def _given_exposures(self) -> list[float]:
         frames = self.inputs.transforms.frames
-        if self.inputs.gains is not None and self.settings.exposure == "given":
-            return list(self.inputs.gains)
+        known = [frame.exposure for frame in frames if frame.exposure is not None]
+        if known and self.settings.exposure == "given":
+            return known
         if self.inputs.exposures is None:
             if self.settings.exposure == "given" and len(frames) > 1:
                 self.notes.append(
@@ -448,8 +449,9 @@ class _Capture:
                 f"photographs of {first.width}x{first.height} reduced to {views[0].width}x{views[0].height} by the mean"
                 f" of {'sensor values' if self.encoded else 'radiance'} over each pixel's area"
             )
-        if self.inputs.instances and len(self.inputs.instances) < len(frames):
-            self.notes.append(f"instances are given for {len(self.inputs.instances)} of {len(frames)} views")
+        given = sum(frame.ids is not None for frame in frames)
+        if 0 < given < len(frames):
+            self.notes.append(f"instances are given for {given} of {len(frames)} views")
         if self.mesh.from_nodes and self.mesh.names is not None:
             self.notes.append(f"the {len(self.mesh.names)} nodes of {self.inputs.mesh.name} serve as instances")
 

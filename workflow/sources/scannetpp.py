@@ -22,6 +22,7 @@ from workflow.runtime.job import Job
 from workflow.sources import folder
 from workflow.sources.folder_scene import colmap, mesh, transforms
 from workflow.sources.folder_scene.inputs import Inputs
+from workflow.sources.folder_scene.transforms import Entry
 
 MESH_FROM_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 """Exchanges rows 0 and 1 and negates row 2: a rotation that is its own inverse."""
@@ -71,7 +72,8 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool =
         raise InputError(f"{cameras}: not found; {made}. `source.images` is {source['images']}; allowed: {', '.join(PLACES)}")
     document = transforms.load(cameras)
     entries, notes, lists = _entries(document, cameras, dslr, pictures, source)
-    notes += _masks(entries, masks)
+    entries, without_masks = _masked(entries, masks)
+    notes += without_masks
     world = MESH_FROM_NERFSTUDIO if source["world"] == "nerfstudio" else None
     listed = transforms.frames_of(cameras, document, entries, pictures, source, settings, world)
     listed, also = _compared_with_colmap(listed, dslr / "colmap", source["world"], points)
@@ -90,33 +92,33 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool =
 
 def _entries(
     document: dict[str, Any], cameras: Path, dslr: Path, pictures: Path, source: dict[str, Any]
-) -> tuple[list[dict[str, Any]], list[str], list[Path]]:
-    """Return the frames of both lists with their `_split`, notes about those left out, and the list file."""
-    entries = [{**e, "_split": "train"} for e in transforms.entries_of(cameras, document)]
+) -> tuple[list[Entry], list[str], list[Path]]:
+    """Return the frames of both lists with their split, notes about those left out, and the list file."""
+    entries = [replace(e, split="train") for e in transforms.entries_of(cameras, document)]
     if document.get("test_frames"):
-        entries += [{**e, "_split": "test"} for e in transforms.entries_of(cameras, document, "test_frames")]
+        entries += [replace(e, split="test") for e in transforms.entries_of(cameras, document, "test_frames")]
     notes: list[str] = []
     path = dslr / "train_test_lists.json"
     if path.is_file():
         stated = _lists(path)
-        entries = [{**e, "_split": stated.get(e["file_path"], e["_split"])} for e in entries]
-        posed = {e["file_path"] for e in entries}
+        entries = [replace(e, split=stated.get(e.file_path, e.split)) for e in entries]
+        posed = {e.file_path for e in entries}
         without = [name for name in stated if name not in posed]
         if without:
             notes.append(f"{len(without)} listed photographs have no pose and are not used, such as {without[0]}")
     if source["drop_bad"]:
-        bad = [e for e in entries if e.get("is_bad")]
-        entries = [e for e in entries if not e.get("is_bad")]
+        bad = [e for e in entries if e.keys.get("is_bad")]
+        entries = [e for e in entries if not e.keys.get("is_bad")]
         if bad:
             notes.append(f"{len(bad)} photographs that the release marks as bad are left out")
-    tests = [e for e in entries if e["_split"] == "test"]
-    hidden = [e for e in tests if not (pictures / e["file_path"]).is_file()]
+    tests = [e for e in entries if e.split == "test"]
+    hidden = [e for e in tests if not (pictures / e.file_path).is_file()]
     if source["lists"] == "train":
         hidden = tests
     elif hidden:
         notes.append(f"{len(hidden)} test photographs are not in {pictures.name}/ (the release withholds some)")
     gone = {id(e) for e in hidden}
-    kept = sorted((e for e in entries if id(e) not in gone), key=lambda entry: entry["file_path"])
+    kept = sorted((e for e in entries if id(e) not in gone), key=lambda entry: entry.file_path)
     return kept, notes, [path] if path.is_file() else []
 
 
@@ -133,14 +135,12 @@ def _lists(path: Path) -> dict[str, str]:
     return {name: key for key, names in found.items() for name in names}
 
 
-def _masks(entries: list[dict[str, Any]], masks: Path) -> list[str]:
-    """Add the anonymisation masks to the entries; returns a note where the release has none."""
+def _masked(entries: list[Entry], masks: Path) -> tuple[list[Entry], list[str]]:
+    """Return the entries with their anonymisation masks, and a note where the release has none."""
     if not masks.is_dir():
-        return [f"no {masks.name}/: nothing is masked"]
-    for entry in entries:
-        entry["_mask"] = masks / str(entry.get("mask_path") or Path(entry["file_path"]).with_suffix(".png"))
-        entry["_mask_full"] = True
-    return []
+        return entries, [f"no {masks.name}/: nothing is masked"]
+    names = [str(e.keys.get("mask_path") or Path(e.file_path).with_suffix(".png")) for e in entries]
+    return [replace(e, mask=masks / name, mask_full=True) for e, name in zip(entries, names, strict=True)], []
 
 
 def _compared_with_colmap(

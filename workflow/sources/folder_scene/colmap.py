@@ -21,7 +21,7 @@ from workflow.intake.documents import check_file, reading
 from workflow.intake.names import shown
 from workflow.sources.folder_scene import transforms
 from workflow.sources.folder_scene.images import EXTENSIONS
-from workflow.sources.folder_scene.transforms import Transforms
+from workflow.sources.folder_scene.transforms import Entry, Transforms
 
 PARTS = ("cameras", "images", "points3D")
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap")
@@ -144,18 +144,13 @@ def _count(data: bytes, least: int) -> int:
     return int(count)
 
 
-def entry_of(model: Model, image: Image) -> dict[str, Any]:
+def entry_of(model: Model, image: Image) -> Entry:
     """Return an entry like those of transforms.json, but with camera-to-world of OpenCV axes."""
     where = f"image {shown(image.name)}"
     if fault := transforms.fault_of_path(image.name):
         raise InputError(f"{model.path}: {where}: its name {fault}")
-    return {
-        **model.cameras[image.camera],
-        "file_path": image.name,
-        "transform_matrix": image.pose.tolist(),
-        "_where": where,
-        "_seen": model.seen(image)[0],
-    }
+    keys = {**model.cameras[image.camera], "transform_matrix": image.pose.tolist()}
+    return Entry(image.name, where, keys, seen=model.seen(image)[0])
 
 
 def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[str, Any], points: bool) -> Transforms:
@@ -179,10 +174,9 @@ def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[s
         raise InputError(f"{root}: not found; `source.images` is the folder that the image names of {model.path} count from")
     entries = [entry_of(model, image) for image in model.images]
     masks = folder / "masks"
-    for entry in entries if masks.is_dir() else []:
-        # COLMAP's own form of the name; 0001.png would be a mask of objects (docs/guide/segmentation.md).
-        name = masks / (entry["file_path"] + ".png")
-        entry["_mask"] = name if name.is_file() else None
+    # COLMAP's own form of the name; 0001.png would be a mask of objects (docs/guide/segmentation.md).
+    named = {entry.file_path: masks / f"{entry.file_path}.png" for entry in entries}
+    entries = [replace(entry, mask=named[entry.file_path]) if named[entry.file_path].is_file() else entry for entry in entries]
     listed = transforms.frames_of(model.path, {}, entries, root, source, capture)
     if points:
         _check_reprojection(model, listed)

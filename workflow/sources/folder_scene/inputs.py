@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +25,7 @@ class Inputs:
         transforms: the checked cameras.
         mesh: the mesh file.
         exposures: exposures.json.
-        instances: name of a view -> its map of object ids.
-        truth: name of a view -> kind -> file.
         metres: per unit of the poses and of the mesh.
-        gains: exposures of the frames that the source itself knows.
         of_vertices: reads the object ids of the mesh's vertices.
         load_ids: reads a map of object ids, given its path and the EXIF turn.
         response: (3, 101) true camera response.
@@ -38,10 +35,7 @@ class Inputs:
     transforms: transforms.Transforms
     mesh: Path
     exposures: Path | None = None
-    instances: dict[str, Path] = field(default_factory=dict)
-    truth: dict[str, dict[str, Path]] = field(default_factory=dict)
     metres: float = 1.0
-    gains: tuple[float, ...] | None = None
     of_vertices: Callable[[], mesh.VertexIds] | None = None
     load_ids: Callable[[Path, int], np.ndarray] = images.load_ids
     response: np.ndarray | None = None
@@ -49,10 +43,8 @@ class Inputs:
 
     def files(self) -> list[Path]:
         """List all files."""
-        out = [self.transforms.path, self.mesh, *([self.exposures] if self.exposures else []), *self.instances.values()]
-        for frame in self.transforms.frames:
-            out += [path for path in (frame.image, frame.depth, frame.mask) if path]
-        out += [path for maps in self.truth.values() for path in maps.values()]
+        out = [self.transforms.path, self.mesh, *([self.exposures] if self.exposures else [])]
+        out += [path for frame in self.transforms.frames for path in frame.files()]
         return [*out, *self.transforms.also, *self.also]
 
 
@@ -82,14 +74,9 @@ def find_inputs(source: dict[str, Any], capture: dict[str, Any], points: bool = 
     has_exposures = exposures.is_file()
     if has_exposures:
         exposure.read_given(exposures, [(f.name, f.file_path) for f in listed.frames])
-    return Inputs(
-        listed,
-        mesh_path,
-        exposures if has_exposures else None,
-        _instances(folder, listed.frames),
-        _truth(folder, listed.frames),
-        metres,
-    )
+    ids, truth = _instances(folder, listed.frames), _truth(folder, listed.frames)
+    frames = tuple(replace(f, ids=ids.get(f.name), truth=truth.get(f.name, {})) for f in listed.frames)
+    return Inputs(replace(listed, frames=frames), mesh_path, exposures if has_exposures else None, metres)
 
 
 def _instances(folder: Path, frames: tuple[Frame, ...]) -> dict[str, Path]:

@@ -1,7 +1,7 @@
 """Reads and checks cameras in the form of `transforms.json` of nerfstudio and instant-ngp, from JSON and image headers only.
 
 Every message names the file, the frame, the value found, the values allowed and the remedy. Other camera files (COLMAP,
-ScanNet++, FIPT) are converted to the same entries and pass the same checks (`frames_of`).
+ScanNet++, FIPT) are read as the same entries and pass the same checks (`frames_of`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import difflib
 import fnmatch
 import math
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +44,35 @@ MIN_OFFSET_IF_SWAPPED = 0.08
 
 
 @dataclass(frozen=True)
+class Entry:
+    """One photograph as a file of cameras lists it, before anything about it is checked.
+
+    Attributes:
+        file_path: as written.
+        where: names it in messages.
+        keys: of its own, as in transforms.json: intrinsics, `transform_matrix`, depth.
+        stated_name: of the view; None = the name of the file without extension.
+        mask, mask_full, split, seen: as in `Frame`.
+    """
+
+    file_path: str
+    where: str
+    keys: dict[str, Any]
+    stated_name: str | None = None
+    mask: Path | None = None
+    mask_full: bool = False
+    split: str | None = None
+    seen: np.ndarray | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the view."""
+        return self.stated_name or Path(self.file_path).stem
+
+
+@dataclass(frozen=True)
 class Frame:
-    """One photograph, as the file describes it.
+    """One photograph and all files that belong to it.
 
     Attributes:
         name: of the view.
@@ -60,6 +87,9 @@ class Frame:
         mask: picture of the pixels that may be used: those that are not 0, or with `mask_full` only those of the largest value.
         split: `train` or `test` where lists say so.
         seen: (n, 3) points of a sparse reconstruction that this photograph sees, in the unit of the poses.
+        exposure: factor on radiance before the response, where the source itself knows it.
+        ids: map of object ids.
+        truth: kind -> map of true materials, emission or radiance.
     """
 
     name: str
@@ -76,6 +106,13 @@ class Frame:
     mask_full: bool = False
     split: str | None = None
     seen: np.ndarray | None = None
+    exposure: float | None = None
+    ids: Path | None = None
+    truth: dict[str, Path] = field(default_factory=dict)
+
+    def files(self) -> list[Path]:
+        """List all files of the photograph."""
+        return [path for path in (self.image, self.depth, self.mask, self.ids, *self.truth.values()) if path]
 
 
 @dataclass(frozen=True)
@@ -137,10 +174,10 @@ def evenly_spread(count: int, wanted: int) -> list[int]:
     return [int((i + 0.5) * count / wanted) for i in range(wanted)]
 
 
-def choose_entries(entries: list[dict[str, Any]], views: int) -> list[dict[str, Any]]:
-    """Return at most `views` entries, evenly spread; at most one in eight is a test photograph (`_split`)."""
-    tests = [e for e in entries if e.get("_split") == "test"]
-    others = [e for e in entries if e.get("_split") != "test"]
+def choose_entries(entries: list[Entry], views: int) -> list[Entry]:
+    """Return at most `views` entries, evenly spread; at most one in eight is a test photograph."""
+    tests = [e for e in entries if e.split == "test"]
+    others = [e for e in entries if e.split != "test"]
     if len(entries) > views:
         kept = min(len(tests), max(1, views // 8)) if views > 1 else 0
         tests = [tests[i] for i in evenly_spread(len(tests), kept)]
@@ -168,9 +205,7 @@ def read(source: dict[str, Any], capture: dict[str, Any]) -> Transforms:
     document = load(path)
     _refuse_misspelt(path, document)
     entries = _listed_splits(path, document, entries_of(path, document))
-    for entry in entries:
-        if entry.get("mask_path"):
-            entry["_mask"] = path.parent / str(entry["mask_path"])
+    entries = [replace(e, mask=path.parent / str(e.keys["mask_path"])) if e.keys.get("mask_path") else e for e in entries]
     world = _applied(path, document) if source["applied_transform"] == "undo" else None
     return frames_of(path, document, entries, path.parent, source, capture, world)
 
@@ -178,7 +213,7 @@ def read(source: dict[str, Any], capture: dict[str, Any]) -> Transforms:
 def frames_of(
     path: Path,
     document: dict[str, Any],
-    entries: list[dict[str, Any]],
+    entries: list[Entry],
     root: Path,
     source: dict[str, Any],
     capture: dict[str, Any],
@@ -189,8 +224,7 @@ def frames_of(
     Args:
         path: the file that messages name.
         document: keys that all frames share (intrinsics), and those of the whole file.
-        entries: one per photograph, with keys as in transforms.json; `_where` names it in messages, and `_name`, `_mask`,
-            `_mask_full`, `_split`, `_seen` fill the fields of Frame.
+        entries: one per photograph.
         root: folder that `file_path` counts from.
         source, capture: the dumped settings sections.
         world: (4, 4) rotation, translation and uniform scale from the world of the poses to the mesh's; None = identity.
@@ -202,7 +236,7 @@ def frames_of(
         InputError: at the first fault.
     """
     raw = choose_entries(_matching(path, entries, source.get("frames")), capture["views"])
-    if all(entry.get("_split") == "test" for entry in raw):
+    if all(entry.split == "test" for entry in raw):
         raise InputError(f"{path}: lists keep all {len(raw)} photographs for testing; at least one must be there to use")
     _unique_names(path, raw)
     located = [(entry, _find_image(path, root, entry)) for entry in raw]
@@ -265,8 +299,8 @@ def _applied(path: Path, document: dict[str, Any]) -> np.ndarray:
     return np.linalg.inv(matrix) @ np.diag([1 / scale, 1 / scale, 1 / scale, 1.0])
 
 
-def _listed_splits(path: Path, document: dict[str, Any], entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Add `_split` to every entry that nerfstudio's lists of file names contain; validation counts as test."""
+def _listed_splits(path: Path, document: dict[str, Any], entries: list[Entry]) -> list[Entry]:
+    """State the split of every entry that nerfstudio's lists of file names contain; validation counts as test."""
     lists = {key: document[key] for key in ("train_filenames", "val_filenames", "test_filenames") if key in document}
     if not lists:
         return entries
@@ -279,16 +313,14 @@ def _listed_splits(path: Path, document: dict[str, Any], entries: list[dict[str,
             other = names.setdefault(name, key)
             if other != key and "train_filenames" in (other, key):
                 raise InputError(f"{path}: {name!r} is in `{other}` and in `{key}`: a test photograph must not be used")
-    unknown = sorted(set(names) - {e["file_path"] for e in entries})
+    unknown = sorted(set(names) - {e.file_path for e in entries})
     if unknown:
         raise InputError(f"{path}: {_some(unknown)} listed for train or test: no frame has such a `file_path`")
-    kept = [e for e in entries if e["file_path"] in names] if "train_filenames" in lists else entries
-    return [
-        {**e, "_split": "train" if names.get(e["file_path"], "train_filenames") == "train_filenames" else "test"} for e in kept
-    ]
+    kept = [e for e in entries if e.file_path in names] if "train_filenames" in lists else entries
+    return [replace(e, split="train" if names.get(e.file_path, "train_filenames") == "train_filenames" else "test") for e in kept]
 
 
-def entries_of(path: Path, document: dict[str, Any], key: str = "frames") -> list[dict[str, Any]]:
+def entries_of(path: Path, document: dict[str, Any], key: str = "frames") -> list[Entry]:
     """Return the checked list of frames of a document."""
     return [_entry(path, i, entry, key) for i, entry in enumerate(_frames(path, document, key))]
 
@@ -334,7 +366,7 @@ def _frames(path: Path, document: dict[str, Any], key: str) -> list[Any]:
     return frames
 
 
-def _entry(path: Path, index: int, entry: Any, key: str) -> dict[str, Any]:
+def _entry(path: Path, index: int, entry: Any, key: str) -> Entry:
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str) or not entry["file_path"]:
         raise InputError(f"{path}: {key}[{index}]: needs a `file_path` (text) and a `transform_matrix`")
     file_path = entry["file_path"].removeprefix("./")
@@ -343,8 +375,7 @@ def _entry(path: Path, index: int, entry: Any, key: str) -> dict[str, Any]:
     for other in ("mask_path", "depth_file_path"):
         if entry.get(other) and (fault := fault_of_path(entry[other])):
             raise InputError(f"{path}: {key}[{index}]: `{other}` {shown(entry[other])} {fault}")
-    stated = {name: value for name, value in entry.items() if not name.startswith("_")}  # reserved for the readers
-    return {**stated, "file_path": file_path, "_where": f"{key}[{index}] ({file_path})"}
+    return Entry(file_path, f"{key}[{index}] ({file_path})", {name: entry[name] for name in entry if name != "file_path"})
 
 
 def fault_of_path(stated: Any) -> str:
@@ -361,37 +392,37 @@ def fault_of_path(stated: Any) -> str:
     return f"names no file ({name!r:.40} {fault})" if fault else ""
 
 
-def _matching(path: Path, entries: list[dict[str, Any]], pattern: str | None) -> list[dict[str, Any]]:
+def _matching(path: Path, entries: list[Entry], pattern: str | None) -> list[Entry]:
     if pattern is None:
         return entries
-    kept = [e for e in entries if fnmatch.fnmatchcase(e["file_path"], pattern)]
+    kept = [e for e in entries if fnmatch.fnmatchcase(e.file_path, pattern)]
     if not kept:
-        example = entries[0]["file_path"]
+        example = entries[0].file_path
         raise InputError(f"{path}: `source.frames: {pattern}` matches none of {len(entries)} frames (such as {example!r})")
     return kept
 
 
-def _unique_names(path: Path, entries: list[dict[str, Any]]) -> None:
-    seen: dict[str, dict[str, Any]] = {}
+def _unique_names(path: Path, entries: list[Entry]) -> None:
+    seen: dict[str, Entry] = {}
     for entry in entries:
-        name = _name(entry)
+        name = entry.name
         if fault := fault_of_name(name):
-            raise InputError(f"{path}: {entry['_where']}: the name of a view {fault}; rename the photograph")
+            raise InputError(f"{path}: {entry.where}: the name of a view {fault}; rename the photograph")
         other = seen.setdefault(same_name(name), entry)
         if other is entry:
             continue
-        if _one_photograph(other["file_path"], entry["file_path"]):
+        if _one_photograph(other.file_path, entry.file_path):
             raise InputError(
-                f"{path}: {other['_where']} and {entry['_where']} are the same photograph, which is listed twice; remove one of"
+                f"{path}: {other.where} and {entry.where} are the same photograph, which is listed twice; remove one of"
                 " the two frames"
             )
-        if _name(other) != name:
+        if other.name != name:
             raise InputError(
-                f"{path}: views {_name(other)!r} and {name!r} differ only in capital letters, which some disks ignore; rename"
+                f"{path}: views {other.name!r} and {name!r} differ only in capital letters, which some disks ignore; rename"
                 " one of the photographs"
             )
         raise InputError(
-            f"{path}: {other['file_path']!r} and {entry['file_path']!r} would both be view {name!r}; file names without"
+            f"{path}: {other.file_path!r} and {entry.file_path!r} would both be view {name!r}; file names without"
             " extension must differ: rename one, or select with `source.frames`"
         )
 
@@ -402,19 +433,15 @@ def _one_photograph(first: str, second: str) -> bool:
     return a == b or (a.with_suffix("") == b.with_suffix("") and "" in (a.suffix, b.suffix))
 
 
-def _name(entry: dict[str, Any]) -> str:
-    return entry.get("_name") or Path(entry["file_path"]).stem
-
-
-def _find_image(path: Path, root: Path, entry: dict[str, Any]) -> Path:
-    stated = root / entry["file_path"]
+def _find_image(path: Path, root: Path, entry: Entry) -> Path:
+    stated = root / entry.file_path
     if stated.suffix.lower() in images.EXTENSIONS:
         return stated
     candidates = [stated.with_name(stated.name + extension) for extension in images.EXTENSIONS]
     found = [c for c in candidates if c.is_file()]
     if len(found) > 1:
         names = " and ".join(c.name for c in found)
-        raise InputError(f"{path}: {entry['file_path']!r} has no extension and {names} exist; name the one you mean")
+        raise InputError(f"{path}: {entry.file_path!r} has no extension and {names} exist; name the one you mean")
     if not found and stated.is_file():
         allowed = ", ".join(images.EXTENSIONS)
         raise InputError(f"{stated}: not an image format that is read here; allowed: {allowed}. Convert it")
@@ -473,13 +500,13 @@ def _pixel_offset(path: Path, document: dict[str, Any], setting: str) -> float:
 def _same_sizes(
     path: Path,
     document: dict[str, Any],
-    located: list[tuple[dict[str, Any], Path]],
+    located: list[tuple[Entry, Path]],
     headers: dict[Path, images.Header],
 ) -> None:
     """Refuse images of different sizes that share the top-level intrinsics."""
     sizes: dict[tuple[int, int], list[Path]] = {}
     for entry, image in located:
-        if not any(key in entry for key in INTRINSICS):
+        if not any(key in entry.keys for key in INTRINSICS):
             header = headers[image]
             stated = (document.get("w"), document.get("h"))
             turned = header.orientation >= 5 and stated == header.size[::-1]
@@ -507,30 +534,30 @@ def _number(path: Path, where: str, values: dict[str, Any], key: str, default: f
 def _frame(
     path: Path,
     document: dict[str, Any],
-    entry: dict[str, Any],
+    entry: Entry,
     image: Path,
     header: images.Header,
     offset: float,
     strict: bool,
 ) -> Frame:
-    where = entry["_where"]
-    values = {key: value for key, value in document.items() if key != "frames"} | entry
+    where = entry.where
+    values = {key: value for key, value in document.items() if key != "frames"} | entry.keys
     width, height, turn = _size(path, where, values, image, header)
     camera = _camera(path, where, values, width, height, offset, strict="w" not in values)
     if strict:
         _not_swapped(path, where, camera)
     depth, depth_camera, depth_matrix = None, None, None
-    if entry.get("depth_file_path"):
-        depth = path.parent / str(entry["depth_file_path"])
+    if entry.keys.get("depth_file_path"):
+        depth = path.parent / str(entry.keys["depth_file_path"])
         if isinstance(values.get("depth_intrinsics"), dict):
             own = values["depth_intrinsics"]
             size = images.header(depth).size if depth.is_file() else (width, height)
             depth_camera = _camera(path, f"{where}: depth_intrinsics", own, *size, offset)
-        if "depth_c2w_opencv" in entry:
+        if "depth_c2w_opencv" in entry.keys:
             depth_matrix = _matrix(path, where, entry, "depth_c2w_opencv")
     return Frame(
-        _name(entry),
-        entry["file_path"],
+        entry.name,
+        entry.file_path,
         image,
         turn,
         camera,
@@ -539,10 +566,10 @@ def _frame(
         depth,
         depth_camera,
         depth_matrix,
-        entry.get("_mask"),
-        entry.get("_mask_full", False),
-        entry.get("_split"),
-        entry.get("_seen"),
+        entry.mask,
+        entry.mask_full,
+        entry.split,
+        entry.seen,
     )
 
 
@@ -652,20 +679,20 @@ def _lens(path: Path, where: str, values: dict[str, Any]) -> Distortion:
     return Distortion("fisheye" if fisheye else "radial_tangential", k, p)
 
 
-def _matrix(path: Path, where: str, entry: dict[str, Any], key: str) -> np.ndarray:
-    if fault := _fault_of_pose(entry, key):
+def _matrix(path: Path, where: str, entry: Entry, key: str) -> np.ndarray:
+    if fault := _fault_of_pose(entry.keys, key):
         raise InputError(f"{path}: {where}: `{key}` {fault}")
-    return np.array(entry[key], np.float64)
+    return np.array(entry.keys[key], np.float64)
 
 
-def _fault_of_pose(entry: dict[str, Any], key: str) -> str:
-    """Return why `entry[key]` is not a rigid camera-to-world matrix, or an empty text if it is."""
+def _fault_of_pose(keys: dict[str, Any], key: str) -> str:
+    """Return why `keys[key]` is not a rigid camera-to-world matrix, or an empty text if it is."""
     try:
-        matrix = np.array(entry.get(key), np.float64)
+        matrix = np.array(keys.get(key), np.float64)
     except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape != (4, 4):
-        found = "missing" if key not in entry else f"has shape {'x'.join(map(str, matrix.shape)) or 'of a scalar'}"
+        found = "missing" if key not in keys else f"has shape {'x'.join(map(str, matrix.shape)) or 'of a scalar'}"
         return f"{found}; expected 4 rows of 4 numbers, camera-to-world"
     if not np.isfinite(matrix).all():
         return "holds NaN or infinity: this image has no pose; remove the frame"
@@ -684,12 +711,12 @@ def _fault_of_pose(entry: dict[str, Any], key: str) -> str:
     return ""
 
 
-def _refuse_bad_poses(path: Path, entries: list[dict[str, Any]]) -> None:
+def _refuse_bad_poses(path: Path, entries: list[Entry]) -> None:
     """Refuse poses that are not rigid; the message names the photographs that share the first fault."""
     photographs: dict[str, list[str]] = {}
     for entry in entries:
-        if fault := _fault_of_pose(entry, "transform_matrix"):
-            photographs.setdefault(fault, []).append(entry["_where"])
+        if fault := _fault_of_pose(entry.keys, "transform_matrix"):
+            photographs.setdefault(fault, []).append(entry.where)
     for fault, where in photographs.items():
         raise InputError(f"{path}: {_some(where, 20)}: `transform_matrix` {fault}")
 
