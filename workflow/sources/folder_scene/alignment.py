@@ -33,6 +33,10 @@ CLEAR_CORRELATION = 0.12
 """Another convention is proposed if its correlation reaches this and three times the correlation of the convention in use."""
 
 
+Trial = tuple[Frame, Pinhole, np.ndarray, np.ndarray]
+"""A photograph on which other conventions are tried: frame, pinhole camera, its pixels (h, w, 3) and valid (h, w)."""
+
+
 @dataclass(frozen=True)
 class Conventions:
     """How `transform_matrix` is interpreted.
@@ -221,7 +225,7 @@ def explain(
 
 
 def explain_edges(
-    trials: list[tuple[Frame, Pinhole, np.ndarray, np.ndarray]],
+    trials: list[Trial],
     trace: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
     conventions: Conventions,
     known: bool,
@@ -230,7 +234,7 @@ def explain_edges(
     """Find a convention that aligns the mesh's edges with those of the photographs.
 
     Args:
-        trials: frame, pinhole camera, its photograph (h, w, 3) and valid (h, w).
+        trials: photographs.
         trace: (origin, directions (h, w, 3)) -> z-depth (h, w) with 0 = miss, and unit normals (h, w, 3).
         conventions: those in use.
         known: whether the format of the file determines the axes.
@@ -378,6 +382,25 @@ class Alignment:
         self.edges[name] = edge_correlation(seen, mesh)
         if compared and (not self.pictures or seen.shape == self.pictures[0][0].shape):
             self.pictures.append((seen.astype(np.float32), mesh.astype(np.float32)))
+
+    def add_depth(
+        self, frame: Frame, conventions: Conventions, view: Pinhole, mesh_depth: np.ndarray, unit: float | None
+    ) -> None:
+        """Add a view by its depth image or, without one, by its sparse points, if it has enough.
+
+        Args:
+            frame: the photograph.
+            conventions: of its poses.
+            view: its pinhole camera.
+            mesh_depth: (h, w) z-depth of the mesh in `view`, metres, 0 = miss.
+            unit: metres per value of the depth image; None = by its format.
+        """
+        if frame.depth is not None:
+            measured = images.load_depth(frame.depth, unit)
+            self.ratios[frame.name] = depth_ratio(frame, conventions, view, mesh_depth, measured)
+        elif frame.seen is not None and len(frame.seen) >= MIN_POINTS:
+            self.what = "sparse points"
+            self.ratios[frame.name] = point_ratio(frame, conventions, view, mesh_depth)
 
     @property
     def depth_disagreement(self) -> float:

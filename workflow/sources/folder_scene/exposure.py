@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
 from workflow.intake import limits
 from workflow.intake.documents import read_json
 from workflow.intake.names import shown
+from workflow.sources.folder_scene.transforms import Frame
 
 MAX_PIXELS = 2_000_000  # of all views together
 MIN_CELL_EDGE = 0.02  # metres; finer cells would hold single pixels
@@ -42,6 +44,30 @@ def read_given(path: Path, frames: list[tuple[str, str]]) -> list[float]:
             raise InputError(f"{path}: exposure of {name!r} is {value:g}; expected {limits.GAIN[0]:g} to {limits.GAIN[1]:g}")
         out.append(float(value))
     return out
+
+
+def given(path: Path | None, frames: Sequence[Frame], setting: str) -> tuple[list[float], list[str]]:
+    """Return the exposure of every frame, 1 where nothing is known or used, and notes.
+
+    Args:
+        path: exposures.json, if there is one.
+        frames: of which the source may know exposures itself.
+        setting: `capture.exposure`, `given` or `estimate`.
+
+    Raises:
+        InputError: as `read_given`.
+    """
+    known, ones = [frame.exposure for frame in frames if frame.exposure is not None], [1.0] * len(frames)
+    if known and setting == "given":
+        return known, []
+    if path is None:
+        if setting == "given" and len(frames) > 1:
+            note = "no exposures.json: the photographs count as equally exposed; with automatic exposure, set"
+            return ones, [f"{note} `capture: {{exposure: estimate}}`"]
+        return ones, []
+    if setting == "estimate":
+        return ones, ["exposures.json is not used: `capture.exposure` is estimate"]
+    return read_given(path, [(frame.name, frame.file_path) for frame in frames]), []
 
 
 class SharedSurface:
