@@ -9,6 +9,7 @@ import numpy as np
 
 from iif_core.camera.gains import CameraGains, radius_squared
 from iif_core.camera.view import View
+from iif_core.surface.triangles import towards_viewer
 
 
 class DecodedView(NamedTuple):
@@ -70,16 +71,12 @@ def pixels_of_view(view: View, decoded: DecodedView, normals: np.ndarray, among:
     points = (view.world_from_camera[:3, 3] + depth.reshape(-1, 1)[hit] * directions).astype(np.float32)
     wo = -directions / np.linalg.norm(directions, axis=1, keepdims=True)
     face = face.ravel()[hit]
-    normals = normals[face].astype(np.float32)
-    front = np.einsum("ij,ij->i", normals, wo) >= 0
-    # Degenerate faces have no normal; the unit vector towards the camera takes its place.
-    flat = np.einsum("ij,ij->i", normals, normals) < 0.5
-    normals = np.where(flat[:, None], wo, np.where(front[:, None], normals, -normals)).astype(np.float32)
+    normals, front = towards_viewer(normals[face].astype(np.float32), wo)
     value = photo.reshape(-1, 3)[hit]
     return ViewPixels(
         hit,
         points,
-        normals,
+        normals.astype(np.float32),
         wo.astype(np.float32),
         face,
         object_id.ravel()[hit],

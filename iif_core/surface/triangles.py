@@ -32,6 +32,28 @@ def face_geometry(vertices: ArrayLike, faces: ArrayLike) -> tuple[NDArray, NDArr
     return cross / np.maximum(length, 1e-30)[:, None], 0.5 * length
 
 
+def towards_viewer(normals: NDArray, towards: NDArray) -> tuple[NDArray, NDArray]:
+    """Turn the normals of faces to the side from which they are seen.
+
+    A face without area has no normal; the direction to the viewer takes its place.
+
+    Args:
+        normals: (n, 3) unit normals, 0 for faces without area.
+        towards: (n, 3) unit vectors to the viewer.
+
+    Returns:
+        The normals (n, 3), and whether the front of each face is seen, (n,) bool.
+
+    Example:
+        >>> normals = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]])
+        >>> towards_viewer(normals, np.array([[0.0, 0.6, 0.8]] * 3))[0].tolist()
+        [[0.0, 0.0, 1.0], [-0.0, -0.0, 1.0], [0.0, 0.6, 0.8]]
+    """
+    front = np.einsum("ij,ij->i", normals, towards) >= 0
+    flat = np.einsum("ij,ij->i", normals, normals) < 0.5
+    return np.where(flat[:, None], towards, np.where(front[:, None], normals, -normals)), front
+
+
 def vertex_normals(vertices: NDArray, faces: NDArray) -> NDArray:
     """Compute unit normals of vertices, (n, 3): the mean of the adjacent faces, weighted by their angles; +z without faces."""
     corner = vertices[faces]

@@ -28,8 +28,9 @@ from workflow.models.denoise import denoise, require_denoiser
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import base_maps, read_gains, read_lit_scene, sensor_bounds, view_pixels
 from workflow.scene.cached_light import read_diffuse, read_specular
+from workflow.scene.named import object_names
 from workflow.scene.normal_form import CaptureReader, View
-from workflow.scene.recovered import object_names, write_response
+from workflow.scene.recovered import write_response
 from workflow.settings.affines import FREE_CELLS
 
 BORDER_WEIGHT = 0.1
@@ -290,7 +291,7 @@ def _start(job: Job) -> Response:
 
 def _write_objects(job: Job, scene: BaseScene, result: _Result, model: str) -> None:
     """Write affine maps that turn the object means of the base, which surface without cells has, into those of the model."""
-    names = object_names(job, scene.n_objects)
+    names = object_names(job.read("segmentation"), scene.n_objects)
     affine = np.tile(IDENTITY, (scene.n_objects, 1))
     if model != "base":
         affine[:] = 0.0

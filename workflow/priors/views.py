@@ -13,7 +13,7 @@ from iif_core.camera.response import Response
 from iif_core.light.irradiance import Trace
 from iif_core.priors.features import ViewArrays, borders, surface_points
 from iif_core.surface.cells import grid_origin
-from iif_core.surface.triangles import face_geometry
+from iif_core.surface.triangles import face_geometry, towards_viewer
 from workflow.runtime import device
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.photograph import GAMMA
@@ -90,11 +90,9 @@ class CaptureViews:
             # The middle pixel of a block lies at the middle of a smaller pixel.
             intrinsics = np.r_[intrinsics[:2] / f, (intrinsics[2:] - (f // 2 + 0.5)) / f + 0.5]
         hit = (face >= 0) & (depth > 0)
-        normals = np.where(hit[..., None], self.face_normals[face], 0)
-        # A face without area has no normal; the unit vector towards the camera takes its place.
         towards = -directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-        normals = np.where(((normals**2).sum(-1, keepdims=True) < 0.5) & hit[..., None], towards, normals)
-        normals = np.where((normals * towards).sum(-1, keepdims=True) < 0, -normals, normals)
+        normals, _ = towards_viewer(self.face_normals[face].reshape(-1, 3), towards.reshape(-1, 3))
+        normals = np.where(hit[..., None], normals.reshape(*hit.shape, 3), 0)
         if group is None:
             group = np.where(hit, self.face_group[face], -1)
         depth = np.where(hit, depth, 0).astype(np.float32)

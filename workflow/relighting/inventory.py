@@ -11,7 +11,7 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.artifacts import StageReader
-from workflow.scene.named import names_of, object_number
+from workflow.scene.named import object_names, object_number
 from workflow.settings.names import did_you_mean
 
 Array = np.ndarray
@@ -41,7 +41,7 @@ class Inventory:
         for emitter in table["emitter_id"][table["kept"].astype(bool) & (table["kind"] == "area")]:
             own = np.unique(object_id[faces["face_id"][faces["emitter_id"] == emitter]])
             lamps.append(Lamp(int(emitter), tuple(int(o) for o in own if o >= 0)))
-        return Inventory(names_of(segmentation), lamps)
+        return Inventory(object_names(segmentation), lamps)
 
     def name_of(self, lamp: Lamp) -> str:
         """Return the names of the objects that a lamp is on, or its number where it is on none."""

@@ -46,15 +46,16 @@ def check_overrides(stage: str, scene: str, quality: str) -> None:
         return
     reader = finished("segmentation", scene, quality)
     if reader is not None:
-        names = names_of(reader)
+        names = object_names(reader)
         for key in wanted:
             object_number(key, names, f"{scene_origin(scene)}: `overrides`")
 
 
-def names_of(segmentation: StageReader) -> list[str]:
-    """Return the name of every object id; `object<id>` where it has none."""
+def object_names(segmentation: StageReader, n_objects: int | None = None) -> list[str]:
+    """Return the name of every object id, of `n_objects` or of those in the table; `object<id>` where it has none."""
     table = segmentation.table("objects.parquet")
-    names = [f"object{i}" for i in range(int(table["object_id"].max(initial=-1)) + 1)]
+    count = int(table["object_id"].max(initial=-1)) + 1 if n_objects is None else n_objects
+    names = [f"object{i}" for i in range(count)]
     for i, name in zip(table["object_id"], table["name"], strict=True):
         names[int(i)] = str(name)
     return names

@@ -13,6 +13,7 @@ from iif_core.reflectance.material import CHANNELS, IDENTITY, apply_affines
 from workflow.artifacts.store import StageReader
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_base, read_lit_scene
+from workflow.scene.named import object_names
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def read_recovered(job: Job) -> Recovered:
     """
     base, light = read_lit_scene(job)
     affines, emission = job.read("affines"), job.read("emission")
-    names = object_names(job, base.n_objects)
+    names = object_names(job.read("segmentation"), base.n_objects)
     cells = read_base(job).table("cells.parquet", ("cell_id", *"xyz"))
     fitted = affines.table("cells.parquet", ("cell_id", *CHANNELS))
     if not np.array_equal(cells["cell_id"], fitted["cell_id"]):
@@ -90,15 +91,6 @@ def emitter_of_faces(job: Job, light: Light) -> np.ndarray:
     emitter_id = np.full(len(light.emits), -1, np.int32)
     emitter_id[faces["face_id"][shines]] = faces["emitter_id"][shines]
     return emitter_id
-
-
-def object_names(job: Job, n_objects: int) -> list[str]:
-    """Return the name of every object id of the segmentation; `object<id>` where it has none."""
-    table = job.read("segmentation").table("objects.parquet")
-    names = [f"object{i}" for i in range(n_objects)]
-    for i, name in zip(table["object_id"], table["name"], strict=True):
-        names[int(i)] = str(name)
-    return names
 
 
 def read_affines(reader: StageReader, n_objects: int) -> np.ndarray:

@@ -33,9 +33,9 @@ from workflow.fitting.inputs import balanced, cells_of, exposure_and_balance, ro
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import base_maps, read_base, read_gains, read_lit_scene, sensor_bounds, view_pixels
 from workflow.scene.cached_light import has_lobes, read_diffuse, read_specular
-from workflow.scene.named import object_number
+from workflow.scene.named import object_names, object_number
 from workflow.scene.normal_form import CaptureReader
-from workflow.scene.recovered import object_names, write_response
+from workflow.scene.recovered import write_response
 from workflow.settings import scene_origin
 from workflow.settings.affines import KnownLamp
 
@@ -45,7 +45,7 @@ def run(job: Job) -> None:
     if job.settings.affines.model != "objects":
         return baselines.run(job)
     capture, (scene, light) = CaptureReader(job.read("capture")), read_lit_scene(job)
-    names = object_names(job, scene.n_objects)
+    names = object_names(job.read("segmentation"), scene.n_objects)
     find_gauge, given = _gauge(job, capture, names), _given(job, names)  # wrong settings stop the stage before any work
     mixed = light.emits | scene.is_sheer
     problem, places = _problem(job, capture, scene, mixed, read_gains(job))

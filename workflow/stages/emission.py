@@ -24,8 +24,8 @@ from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_base_scene
 from workflow.scene.emission_views import ViewRecords, view_exposures
 from workflow.scene.light_files import write_found_light
+from workflow.scene.named import object_names
 from workflow.scene.normal_form import CaptureReader
-from workflow.scene.recovered import object_names
 from workflow.scene.response_file import read_response_file
 from workflow.settings.light import PUBLISHED
 
@@ -75,7 +75,7 @@ def _photographs(job: Job, capture: CaptureReader, notes: list[str]) -> tuple[Ph
         views=capture.used,
         every=capture.views,
         scene=scene,
-        names=object_names(job, scene.n_objects),
+        names=object_names(job.read("segmentation"), scene.n_objects),
         tracer=Tracer(scene),
         sensor=Sensor(response("identity"), capture.is_hdr, own.saturation),
         gains=view_exposures(capture, notes),

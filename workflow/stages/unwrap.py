@@ -9,8 +9,9 @@ from iif_core.surface.triangles import face_geometry
 from workflow.exporters.surface import Part, SeenSurface, build_parts, seen_sides
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_lit_scene
+from workflow.scene.named import object_names
 from workflow.scene.normal_form import CaptureReader
-from workflow.scene.recovered import emitter_of_faces, object_names
+from workflow.scene.recovered import emitter_of_faces
 
 EMITTER_TEXELS = 4.0
 """Side of a square of texels for an emitter, whose material is black all over."""
@@ -28,7 +29,14 @@ def run(job: Job) -> None:
     front, back, footprint = _observed(job, capture, base.vertices, base.faces, base.object_id, n_objects)
     emitter_id = emitter_of_faces(job, light)
     surface = SeenSurface(
-        base.vertices, base.faces, base.object_id, object_names(job, n_objects), emitter_id, light.side, front, back
+        base.vertices,
+        base.faces,
+        base.object_id,
+        object_names(job.read("segmentation"), n_objects),
+        emitter_id,
+        light.side,
+        front,
+        back,
     )
     parts = build_parts(surface, wanted.max_faces_glb)
     count = sum(len(part.faces) for part in parts)
