@@ -28,6 +28,7 @@ from workflow.models.denoise import denoise, require_denoiser
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import base_maps, read_gains, read_lit_scene, sensor_bounds, view_pixels
 from workflow.scene.cached_light import read_diffuse, read_specular
+from workflow.scene.decoded import DecodedViews
 from workflow.scene.named import object_names
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import write_response
@@ -227,6 +228,7 @@ class CellPixels:
 
     def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray, block_of: np.ndarray, blocks: int):
         self.job, self.capture, self.scene, self.mixed, self.block_of = job, capture, scene, mixed, block_of
+        self.decoded = DecodedViews(capture, job.read("segmentation"))
         require_denoiser()
         self.levels = len(roughness_levels(job))
         light, samples, self.count = BlockLight(blocks), [np.zeros(0)], 0
@@ -247,7 +249,7 @@ class CellPixels:
         job, capture, gains = self.job, self.capture, read_gains(self.job)
         views = capture.used
         for done, view in enumerate(views):
-            pixels = view_pixels(job, capture, self.scene, view)
+            pixels = self.decoded.pixels(view, self.scene.normals)
             cell = cells_of(job, view)[pixels.index]
             use = pixels.valid & (cell >= 0) & ~self.mixed[pixels.face]
             d = _denoised(read_diffuse(job, view), view, pixels)[use] if diffuse is None else np.zeros(0)

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from iif_core.camera.gains import CameraGains
-from iif_core.camera.pixels import DecodedView, ViewPixels, pixels_of_view
+from iif_core.camera.pixels import ViewPixels
 from iif_core.light.base_scene import BaseScene, Light
 from iif_core.reflectance.material import CHANNELS, NEUTRAL
 from iif_core.surface.triangles import face_geometry
-from workflow.artifacts.store import StageReader, ids_from_disk, rgb
+from workflow.artifacts.store import StageReader, rgb
 from workflow.runtime.job import Job
+from workflow.scene.decoded import DecodedViews
 from workflow.scene.normal_form import CaptureReader, View
 
 if TYPE_CHECKING:
@@ -75,20 +76,9 @@ def sensor_bounds(value: np.ndarray, is_hdr: bool, saturation: float) -> tuple[n
     return np.minimum(value, saturation), value >= saturation
 
 
-def decode_view(job: Job, capture: CaptureReader, view: View) -> DecodedView:
-    """Read the three files of a view; the photograph of a held-out view is not read, and none of its pixels is valid."""
-    if view.split == "test":
-        photo, valid = np.zeros((view.height, view.width, 3), np.float32), np.zeros((view.height, view.width), bool)
-    else:
-        photo, valid = capture.photo(view)
-    depth, face = capture.gbuffer(view)
-    maps = job.read("segmentation").exr(f"maps/{view.name}.exr")
-    return DecodedView(photo, valid, depth, face, ids_from_disk(maps["object.id"]), maps["interior"] > 0.5)
-
-
 def view_pixels(job: Job, capture: CaptureReader, scene: BaseScene, view: View) -> ViewPixels:
-    """Collect the pixels of a view that hit the mesh; no pixel of a held-out view is valid."""
-    return pixels_of_view(view, decode_view(job, capture, view), scene.normals)
+    """Collect the pixels of a view that hit the mesh, once; `DecodedViews` is for several passes."""
+    return DecodedViews(capture, job.read("segmentation"), 0).pixels(view, scene.normals)
 
 
 def base_maps(job: Job, view: View) -> np.ndarray:

@@ -9,7 +9,8 @@ from iif_core.light.base_scene import BaseScene
 from iif_core.light.emission.photographs import SEEDS, ViewRecord
 from workflow.decisions import camera as decisions
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import base_maps, decode_view
+from workflow.scene.base_scene import base_maps
+from workflow.scene.decoded import DecodedViews
 from workflow.scene.normal_form import CaptureReader, View
 
 VIEW_MEMORY_MB = 1024.0
@@ -26,7 +27,7 @@ class ViewRecords:
     """
 
     def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene):
-        self.job, self.capture, self.scene = job, capture, scene
+        self.job, self.scene, self.views = job, scene, DecodedViews(capture, job.read("segmentation"), 0)
         self.share = min(1.0, job.settings.emission.pixels / max(sum(view.width * view.height for view in capture.used), 1))
         self._kept: dict[int, ViewRecord] = {}
         self._megabytes = 0.0
@@ -46,7 +47,7 @@ class ViewRecords:
             rng = np.random.default_rng([self.job.seed, SEEDS, 5, view.view_id])
             among = rng.random((view.height, view.width)) < self.share
         base = None if view.split == "test" else base_maps(self.job, view)
-        return ViewRecord.of(view, decode_view(self.job, self.capture, view), self.scene.normals, base, among)
+        return ViewRecord.of(view, self.views.decoded(view), self.scene.normals, base, among)
 
 
 def view_exposures(capture: CaptureReader, notes: list[str]) -> CameraGains:

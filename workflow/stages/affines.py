@@ -31,8 +31,9 @@ from workflow.fitting.cell_textures import CellTextures
 from workflow.fitting.fit_pixels import FitPixels, count_eligible
 from workflow.fitting.inputs import balanced, cells_of, exposure_and_balance, roughness_levels
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import base_maps, read_base, read_gains, read_lit_scene, sensor_bounds, view_pixels
+from workflow.scene.base_scene import base_maps, read_base, read_gains, read_lit_scene, sensor_bounds
 from workflow.scene.cached_light import has_lobes, read_diffuse, read_specular
+from workflow.scene.decoded import DecodedViews
 from workflow.scene.named import object_names, object_number
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import write_response
@@ -263,13 +264,14 @@ def _problem(
     job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray, gains: CameraGains
 ) -> tuple[FitProblem, _Places]:
     """Draw the pixels of the fit evenly over objects and read their cached shading (docs/method/fitting.md#which-pixels)."""
+    decoded = DecodedViews(capture, job.read("segmentation"))
     views, asked, published = capture.used, job.settings.affines.pixels, job.settings.affines.solver == "published"
     if published and asked == "all":
         drawn = FitPixels.every(scene.n_objects, mixed)
     else:
         counts = np.zeros(max(scene.n_objects, 1), np.int64)
         for view in views:
-            counts += count_eligible(view_pixels(job, capture, scene, view), mixed, scene.n_objects)
+            counts += count_eligible(decoded.pixels(view, scene.normals), mixed, scene.n_objects)
         drawn = FitPixels.evenly(counts, int(counts.sum()) if asked == "all" else asked, mixed, job.seed)
     levels = roughness_levels(job)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("object", "value", "exposure", "view", "index", "cell")}
@@ -277,7 +279,7 @@ def _problem(
     folder = job.writer.directory
     base, cached = Joined(folder), [[Joined(folder) for _ in range(3)] for _ in range(1 if published else 2)]
     for done, view in enumerate(views):
-        pixels, specular = view_pixels(job, capture, scene, view), read_specular(job, view)
+        pixels, specular = decoded.pixels(view, scene.normals), read_specular(job, view)
         pixels = pixels.take(drawn.of(pixels, view))
         index = pixels.index
         rows["object"].append(pixels.object_id)

@@ -27,6 +27,7 @@ from workflow.artifacts.scratch import Scratch
 from workflow.artifacts.store import StageReader, ids_from_disk, ids_to_disk, rgb, split_rgb
 from workflow.decisions import numerics
 from workflow.runtime.job import Job
+from workflow.scene.decoded import DecodedViews
 from workflow.scene.normal_form import CaptureReader, View
 
 MEMORY_BYTES = 1 << 30
@@ -92,9 +93,9 @@ def fuse(job: Job, prior: Predictions) -> None:
     capture = CaptureReader(job.read("capture"))
     segmentation, settings = job.read("segmentation"), job.settings.base
     views = [view for view in capture.used if prior.has(view)]
-    surface = _Surface(capture, segmentation)
-    grid, cell_maps = _cells(job, capture, surface, views)
-    weights, segment_maps = _pixels(job, capture, segmentation, views)
+    decoded = DecodedViews(capture, segmentation)
+    grid, cell_maps = _cells(job, decoded, views)
+    weights, segment_maps = _pixels(job, decoded, views)
     segments = segmentation.table("segments.parquet")
     n_objects = int(segmentation.table("objects.parquet")["object_id"].max(initial=-1)) + 1
     used = 1 if settings.variant == "raw" else min(prior.samples, settings.predictions or prior.samples)
@@ -106,8 +107,8 @@ def fuse(job: Job, prior: Predictions) -> None:
         grid.object_id,
         segments["object_id"].astype(np.int32),
         weights,
-        point=_points(capture, views),
-        tangent=_tangents(capture, views),
+        point=_points(decoded, views),
+        tangent=_tangents(decoded, views),
         neighbours=neighbour_pairs(grid.keys) if settings.seams else None,
         scale=lambda position: prior.scale(views[position]),
     )
@@ -125,7 +126,7 @@ def fuse(job: Job, prior: Predictions) -> None:
     unseen = np.quantile(every[:, 5:], 0.9, axis=0)  # scale and uncertainty of surface that no prediction shows
     values = CellValues(grid, every)
     for done, view in enumerate(capture.views):
-        maps = _maps(surface, values, unseen, result, view)
+        maps = _maps(decoded, values, unseen, result, view)
         if settings.variant == "raw" and view in views:
             maps |= _raw_maps(prior, view, ids_from_disk(maps["cell.id"]) >= 0)
         job.writer.exr(f"maps/{view.name}.exr", maps)
@@ -220,28 +221,22 @@ def _solve(job: Job, problem: FusionProblem) -> tuple[FusionResult, SgdFit | Non
     return solve_direct(problem, options, progress, job.threads), None
 
 
-class _Surface:
-    """Reader of the surface points and object ids of the pixels of a view."""
-
-    def __init__(self, capture: CaptureReader, segmentation: StageReader):
-        self.capture, self.segmentation = capture, segmentation
-
-    def __call__(self, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(index of pixels on the mesh (m,), points (m, 3), object ids (m,)); index is into the flattened image."""
-        depth, face_id = self.capture.gbuffer(view)
-        object_id = ids_from_disk(self.segmentation.exr(f"maps/{view.name}.exr")["object.id"])
-        index = np.flatnonzero((face_id >= 0) & (depth > 0) & (object_id >= 0)).astype(np.int32)
-        points = self.capture.points(view, depth).reshape(-1, 3)[index]
-        return index, points, object_id.ravel()[index]
+def _on_surface(decoded: DecodedViews, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the pixels on the mesh that show an object (m,), as index into the flattened image, their points (m, 3) and their
+    object ids (m,)."""
+    (depth, face_id), object_id = decoded.gbuffer(view), decoded.segmented(view).object_id
+    index = np.flatnonzero((face_id >= 0) & (depth > 0) & (object_id >= 0)).astype(np.int32)
+    points = decoded.capture.points(view, depth).reshape(-1, 3)[index]
+    return index, points, object_id.ravel()[index]
 
 
-def _cells(job: Job, capture: CaptureReader, surface: _Surface, views: list[View]) -> tuple[CellGrid, list[np.ndarray]]:
+def _cells(job: Job, decoded: DecodedViews, views: list[View]) -> tuple[CellGrid, list[np.ndarray]]:
     """The grid and the cell of every pixel, (H * W,) int32 per view with -1 = none."""
-    vertices, faces = capture.mesh()
+    vertices, faces = decoded.capture.mesh()
     corners = vertices[np.unique(faces)]
     edge = job.settings.base.cell_edge
     if edge is None:
-        footprint = median_footprint(_seen_depths(capture, views))
+        footprint = median_footprint(_seen_depths(decoded, views))
         if footprint is None:
             raise InputError("base: no pixel of any view with predictions sees the mesh; check the alignment of the capture")
         edge = job.settings.base.cell_footprints * footprint
@@ -254,7 +249,7 @@ def _cells(job: Job, capture: CaptureReader, surface: _Surface, views: list[View
 
     def points_of_views() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for view in views:
-            index, points, objects = surface(view)
+            index, points, objects = _on_surface(decoded, view)
             pixels.append(index)
             yield points, objects
 
@@ -268,29 +263,27 @@ def _cells(job: Job, capture: CaptureReader, surface: _Surface, views: list[View
     return grid, maps
 
 
-def _seen_depths(capture: CaptureReader, views: list[View]) -> Iterator[tuple[np.ndarray, float]]:
+def _seen_depths(decoded: DecodedViews, views: list[View]) -> Iterator[tuple[np.ndarray, float]]:
     """z-depths of the pixels of each view that see the mesh, and the focal length in pixels."""
     for view in views:
-        depth, face_id = capture.gbuffer(view)
+        depth, face_id = decoded.gbuffer(view)
         yield depth[(face_id >= 0) & (depth > 0)], view.fx
 
 
-def _pixels(
-    job: Job, capture: CaptureReader, segmentation: StageReader, views: list[View]
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _pixels(job: Job, decoded: DecodedViews, views: list[View]) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Weight and segment of every pixel of each view, flattened; pixels that the photograph does not show weigh 0."""
     settings = job.settings.base
     weights, segments = [], []
     footprints = [None] * len(views)
     if settings.footprint_power > 0:
-        pixels = _pixel_geometry(capture, views)
+        pixels = _pixel_geometry(decoded, views)
         footprints = relative_footprints((*pixels(position), view.fx) for position, view in enumerate(views))
     for view, footprint in zip(views, footprints, strict=True):
-        channels = segmentation.exr(f"maps/{view.name}.exr")
-        _, valid = capture.photo(view)
-        interior = channels["interior"] > 0.5
-        weights.append(pixel_weights(interior, valid, settings.border_weight, footprint, settings.footprint_power).ravel())
-        segments.append(ids_from_disk(channels["segment.id"]).ravel())
+        segmented, (_, valid) = decoded.segmented(view), decoded.capture.photo(view)
+        weights.append(
+            pixel_weights(segmented.interior, valid, settings.border_weight, footprint, settings.footprint_power).ravel()
+        )
+        segments.append(segmented.segment_id.ravel())
     return weights, segments
 
 
@@ -315,23 +308,23 @@ def _judged(job: Job, problem: FusionProblem, result: FusionResult, fit: SgdFit 
     return out
 
 
-def _points(capture: CaptureReader, views: list[View]) -> Callable[[int], np.ndarray]:
+def _points(decoded: DecodedViews, views: list[View]) -> Callable[[int], np.ndarray]:
     """view -> (H * W, 3) float32 surface points."""
-    return lambda position: capture.points(views[position], capture.gbuffer(views[position])[0]).reshape(-1, 3)
+    return lambda position: decoded.capture.points(views[position], decoded.gbuffer(views[position])[0]).reshape(-1, 3)
 
 
-def _tangents(capture: CaptureReader, views: list[View]) -> Callable[[int], np.ndarray]:
+def _tangents(decoded: DecodedViews, views: list[View]) -> Callable[[int], np.ndarray]:
     """view -> (H * W, 2, 3) float32 displacement of the surface point over one pixel to the right and down, m."""
-    pixels = _pixel_geometry(capture, views)
+    pixels = _pixel_geometry(decoded, views)
     return lambda position: surface_tangents(*pixels(position)).reshape(-1, 2, 3)
 
 
-def _pixel_geometry(capture: CaptureReader, views: list[View]) -> Callable[[int], tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _pixel_geometry(decoded: DecodedViews, views: list[View]) -> Callable[[int], tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """view -> z-depth (H, W) in m, viewing directions (H, W, 3) and normals (H, W, 3) of the faces."""
-    normals, _ = face_geometry(*capture.mesh())
+    normals, _ = face_geometry(*decoded.capture.mesh())
 
     def of_view(position: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        depth, face_id = capture.gbuffer(views[position])
+        depth, face_id = decoded.gbuffer(views[position])
         return depth, views[position].directions(), normals[face_id]
 
     return of_view
@@ -400,13 +393,15 @@ def _write_segments(job: Job, result: FusionResult, segment_id: np.ndarray, obje
     )
 
 
-def _maps(surface: _Surface, cells: CellValues, unseen: np.ndarray, result: FusionResult, view: View) -> dict[str, np.ndarray]:
+def _maps(
+    decoded: DecodedViews, cells: CellValues, unseen: np.ndarray, result: FusionResult, view: View
+) -> dict[str, np.ndarray]:
     """Channels of one view; pixels without surface are 0.
 
     `cells` holds value, scale and uncertainty (n_cells, 15). Surface in no cell, which test views show, has the mean of the
     cells around it, or else the mean of its object with the scale and uncertainty `unseen` (10,).
     """
-    index, points, objects = surface(view)
+    index, points, objects = _on_surface(decoded, view)
     fallback = np.concatenate([result.object_value[objects], np.broadcast_to(unseen, (len(index), 10))], 1)
     values, row = cells.at(points, objects, fallback)
     shape, size = (view.height, view.width), view.height * view.width

@@ -23,8 +23,9 @@ from workflow.decisions.record import PROVISIONAL, Decision
 from workflow.fitting.fit_pixels import FitPixels, count_eligible
 from workflow.runtime import device
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import read_lit_scene, read_object_gains, read_radiance_cache, view_pixels
+from workflow.scene.base_scene import read_lit_scene, read_object_gains, read_radiance_cache
 from workflow.scene.cached_light import UNITS, SpecularLight, table_of
+from workflow.scene.decoded import DecodedViews
 from workflow.scene.normal_form import CaptureReader, View
 
 if TYPE_CHECKING:
@@ -60,7 +61,8 @@ def run(job: Job) -> None:
     capture, (scene, light) = CaptureReader(job.read("capture")), read_lit_scene(job)
     levels = roughness_levels(job.settings.shading.levels)
     mixed = light.emits | scene.is_sheer
-    cells, counts = _cells(job, capture, scene, mixed)
+    decoded = DecodedViews(capture, job.read("segmentation"))
+    cells, counts = _cells(job, decoded, scene, mixed)
     pixels = job.settings.shading.pixels
     drawn = None if pixels == "all" else FitPixels.evenly(counts, int(pixels), mixed, job.seed)
     device.mitsuba()
@@ -74,19 +76,19 @@ def run(job: Job) -> None:
         diffuse = _diffuse(job, world, cells)
     with job.timed("specular"):
         lit = world if specular["included"] else None
-        traced = _views(job, capture, scene, lit, levels, cells, diffuse, drawn)
+        traced = _views(job, decoded, scene, lit, levels, cells, diffuse, drawn)
     job.writer.table("levels.parquet", {"level": np.arange(len(levels), dtype=np.int32), "roughness": levels})
     facts = {"diffuse": _facts(cells, diffuse), "specular": {"pixels": traced}, "plan": [specular, decision]}
     job.writer.json("shading.json", {**facts, "numerics": numerics.of_shading(diffuse, job.settings.shading.noise)})
 
 
-def _cells(job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray) -> tuple[ShadingCells, np.ndarray]:
+def _cells(job: Job, decoded: DecodedViews, scene: BaseScene, mixed: np.ndarray) -> tuple[ShadingCells, np.ndarray]:
     """Cells of all views; and how many pixels of each object may enter the fit, (O,)."""
     edge = job.settings.shading.cell_edge
     builder = ShadingCellBuilder(edge, grid_origin(scene.vertices[scene.faces.ravel()], edge))
     counts = np.zeros(max(scene.n_objects, 1), np.int64)
-    for view in capture.views:
-        pixels = view_pixels(job, capture, scene, view)
+    for view in decoded.capture.views:
+        pixels = decoded.pixels(view, scene.normals)
         builder.add(pixels.points, pixels.normals, pixels.object_id, _seed(job, view.view_id))
         if view.split != "test":
             counts += count_eligible(pixels, mixed, scene.n_objects)
@@ -158,7 +160,7 @@ def _diffuse(job: Job, world: Scene, cells: ShadingCells) -> DiffuseShading:
 
 def _views(
     job: Job,
-    capture: CaptureReader,
+    decoded: DecodedViews,
     scene: BaseScene,
     world: Scene | None,
     levels: np.ndarray,
@@ -169,10 +171,10 @@ def _views(
     """Write the specular light of the pixels that are `drawn` (None = all), and the diffuse light of the cells. The latter is
     averaged with the diffuse light that the pixels' own paths find (Eq. S.19). Nothing is traced for held-out views, and nothing
     at all without a `world`. Returns the number of pixels that were traced."""
-    count = 0
-    for done, view in enumerate(capture.views):
-        job.progress(done, len(capture.views), "views cached")
-        pixels = view_pixels(job, capture, scene, view)
+    count, views = 0, decoded.capture.views
+    for done, view in enumerate(views):
+        job.progress(done, len(views), "views cached")
+        pixels = decoded.pixels(view, scene.normals)
         light = diffuse.diffuse[:, cells.find(pixels.points, pixels.normals, pixels.object_id)].astype(np.float32)
         own = np.arange(len(pixels.index)) if drawn is None else drawn.of(pixels, view)
         own = own[:0] if view.split == "test" else own
@@ -190,7 +192,7 @@ def _views(
             channels |= _channels(f"half{half}.diffuse", light[half], pixels.index, view.height, view.width)
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative")
         job.writer.table(table_of(view), SpecularLight(pixels.index[own], s0, s1).columns(), UNITS)
-    job.progress(len(capture.views), len(capture.views), "views cached")
+    job.progress(len(views), len(views), "views cached")
     return count
 
 
