@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from iif_core.camera.pixels import ViewPixels
 from iif_core.errors import InputError
-from workflow.artifacts.store import rgb
+from iif_core.light.shading import PixelLight
+from iif_core.surface.shading_cells import DiffuseShading, ShadingCells
+from workflow.artifacts.store import rgb, split_rgb
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import View
 
@@ -76,3 +80,41 @@ def read_diffuse(job: Job, view: View) -> np.ndarray:
     """Read the diffuse light of every pixel of a view, (2, H, W, 3) float32 in two independent halves; 0 where nothing is hit."""
     channels = job.read("shading").exr(f"maps/{view.name}.exr")
     return np.stack([rgb(channels, f"half{h}.diffuse") for h in range(2)])
+
+
+def write_light_of_view(job: Job, view: View, pixels: ViewPixels, found: PixelLight) -> None:
+    """Write maps/<view>.exr and pixels/<view>.parquet of stage shading; `pixels`: all that the light was computed for.
+
+    Raises:
+        InputError: the light is not finite.
+    """
+    if not all(np.isfinite(part).all() for part in (found.diffuse, found.s0, found.s1)):
+        raise InputError(f"view {view.name}: cached shading is not finite; please report it with the scene")
+    channels: dict[str, np.ndarray] = {}
+    for half in range(2):
+        image = np.zeros((view.height * view.width, 3), np.float32)
+        image[pixels.index] = found.diffuse[half]
+        channels |= split_rgb(image.reshape(view.height, view.width, 3), f"half{half}.diffuse")
+    job.writer.exr(f"maps/{view.name}.exr", channels, "relative")
+    job.writer.table(table_of(view), SpecularLight(pixels.index[found.own], found.s0, found.s1).columns(), UNITS)
+
+
+def facts_of_diffuse(cells: ShadingCells, diffuse: DiffuseShading) -> dict[str, Any]:
+    """Return what shading.json says of the diffuse light of the cells."""
+    return {
+        "cells": len(cells),
+        "cell_edge_m": cells.edge,
+        "pixels_per_cell": float(cells.pixels.mean()),
+        "paths_per_cell": float(diffuse.samples.mean()),
+        "noise_first": diffuse.noise_first,
+        "noise_last": diffuse.noise_last,
+        "noisy_objects": diffuse.noisy_objects,
+    }
+
+
+def words_of_diffuse(cells: ShadingCells, diffuse: DiffuseShading, noise: float) -> str:
+    """Describe the diffuse light of the cells for the log; `noise`: that was asked for."""
+    return (
+        f"diffuse light of {len(cells)} cells: {diffuse.samples.mean():.0f} paths each; noise {diffuse.noise_first:.1%} after the"
+        f" first paths, {diffuse.noise_last:.1%} at the end ({diffuse.noisy_objects} objects above {noise:.1%})"
+    )
