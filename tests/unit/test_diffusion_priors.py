@@ -22,8 +22,8 @@ from workflow.models import checkpoint
 from workflow.priors import diffusion, marigold, rgbx
 from workflow.scene.normal_form import View
 from workflow.scene.photograph import picture_for_model
+from workflow.scene.predictions import StoredPredictions
 from workflow.stages import prior as stage
-from workflow.stages.base import StoredPredictions
 
 MODULES = {"rgbx": rgbx, "marigold": marigold}
 HEIGHT, WIDTH = 40, 56

@@ -14,7 +14,8 @@ from workflow.runtime.job import Job
 from workflow.scene.base_scene import SECOND_LOOK
 from workflow.scene.cached_light import read_diffuse
 from workflow.scene.normal_form import CaptureReader, View
-from workflow.stages.base import StoredPredictions, fuse
+from workflow.scene.predictions import StoredPredictions
+from workflow.stages.base import fuse
 
 
 def run(job: Job) -> None:

@@ -1,0 +1,108 @@
+"""The files in which stage base writes cells, segments and maps (docs/reference/artefacts.md)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from iif_core.fusion.problem import FusionResult
+from iif_core.reflectance.material import CHANNELS, PROPERTIES
+from iif_core.surface.cell_grid import CellGrid, CellValues
+from iif_core.surface.cells import unpack_keys
+from workflow.artifacts.store import ids_to_disk, split_rgb
+from workflow.runtime.job import Job
+from workflow.scene.decoded import DecodedViews
+from workflow.scene.fusion_input import on_surface
+from workflow.scene.normal_form import View
+from workflow.scene.predictions import Predictions
+
+
+def raw_maps(prior: Predictions, view: View, surface: np.ndarray) -> dict[str, np.ndarray]:
+    """Channels of the first usable prediction of a view, unchanged, where there is surface."""
+    maps = prior.maps(view, prior.samples)
+    good = np.isfinite(maps).mean((1, 2, 3)) > 0.99
+    first = np.where(surface[..., None], maps[int(np.argmax(good))], 0).astype(np.float32)
+    return {**split_rgb(first[..., :3], "albedo"), "roughness": first[..., 3], "metallic": first[..., 4]}
+
+
+def write_cells(job: Job, grid: CellGrid, n_objects: int, result: FusionResult) -> None:
+    """Write cells.parquet and objects.parquet."""
+    ijk, objects = unpack_keys(grid.keys)
+    job.writer.table(
+        "cells.parquet",
+        {
+            "cell_id": np.arange(len(grid), dtype=np.int32),
+            **{name: ijk[:, a] for a, name in enumerate("ijk")},
+            "object_id": objects,
+            "part_id": result.part_of_cell,
+            **{name: grid.centre[:, a] for a, name in enumerate("xyz")},
+            "observations": result.observations,
+            "views": result.views,
+            "coverage": result.coverage,
+            **{name: result.value[:, c] for c, name in enumerate(CHANNELS)},
+            **{f"scale_{name}": result.scale[:, c] for c, name in enumerate(CHANNELS)},
+            **{f"uncertainty_{name}": result.uncertainty[:, c] for c, name in enumerate(CHANNELS)},
+        },
+        {**dict.fromkeys("xyz", "m"), "coverage": "weighted pixels"},
+    )
+    means, counted = result.object_value[:n_objects], result.object_cells[:n_objects].astype(np.int32)
+    columns = {name: means[:, c] for c, name in enumerate(CHANNELS)}
+    job.writer.table("objects.parquet", {"object_id": np.arange(n_objects, dtype=np.int32), "cells": counted, **columns})
+
+
+def write_segments(job: Job, result: FusionResult, segment_id: np.ndarray, object_id: np.ndarray) -> None:
+    """Write segments.parquet and selection.parquet; `object_id` (S,) of the segments that were solved for."""
+    n, k = result.weight.shape[:2]
+    ids = segment_id.astype(np.int32) if n == len(segment_id) else np.arange(n, dtype=np.int32)
+    best = result.weight.argmax(1).astype(np.int32)
+    job.writer.table(
+        "segments.parquet",
+        {
+            "segment_id": ids,
+            "object_id": np.asarray(object_id, np.int32),
+            **{f"best_{name}": best[:, p] for p, name in enumerate(PROPERTIES)},
+            **{f"margin_{name}": result.margin[:, p] for p, name in enumerate(PROPERTIES)},
+            **{f"effective_{name}": result.effective[:, p] for p, name in enumerate(PROPERTIES)},
+        },
+    )
+    job.writer.table(
+        "selection.parquet",
+        {
+            "segment_id": np.repeat(ids, k),
+            "k": np.tile(np.arange(k, dtype=np.int32), n),
+            **{f"weight_{name}": result.weight[..., p].ravel() for p, name in enumerate(PROPERTIES)},
+            **{f"probability_{name}": result.probability[..., p].ravel() for p, name in enumerate(PROPERTIES)},
+            "affine_albedo": result.affine_albedo.reshape(n * k, 12),
+            "affine_roughness": result.affine_roughness.reshape(n * k, 2),
+            "affine_metallic": result.affine_metallic.reshape(n * k, 2),
+            **{f"error_{name}": result.error[..., p].ravel() for p, name in enumerate(PROPERTIES)},
+        },
+    )
+
+
+def maps_of_view(
+    decoded: DecodedViews, cells: CellValues, unseen: np.ndarray, result: FusionResult, view: View
+) -> dict[str, np.ndarray]:
+    """Channels of one view; pixels without surface are 0.
+
+    `cells` holds value, scale and uncertainty (n_cells, 15). Surface in no cell, which test views show, has the mean of the
+    cells around it, or else the mean of its object with the scale and uncertainty `unseen` (10,).
+    """
+    index, points, objects = on_surface(decoded, view)
+    fallback = np.concatenate([result.object_value[objects], np.broadcast_to(unseen, (len(index), 10))], 1)
+    values, row = cells.at(points, objects, fallback)
+    shape, size = (view.height, view.width), view.height * view.width
+    cell, covered, full = np.full(size, -1, np.int32), np.zeros(size, np.float32), np.zeros((size, 15), np.float32)
+    cell[index], full[index] = row, values
+    covered[index] = np.where(row >= 0, result.coverage[row], 0)
+    full = full.reshape(*shape, 15)
+    out = {
+        "cell.id": ids_to_disk(cell.reshape(shape)),
+        **split_rgb(full[..., :3], "albedo"),
+        "roughness": full[..., 3],
+        "metallic": full[..., 4],
+        "coverage": covered.reshape(shape),
+    }
+    for name, first in (("scale", 5), ("uncertainty", 10)):
+        out[f"{name}.albedo"] = full[..., first : first + 3].mean(-1)
+        out[f"{name}.roughness"], out[f"{name}.metallic"] = full[..., first + 3], full[..., first + 4]
+    return out
