@@ -14,10 +14,10 @@ from iif_core.fitting.selection import ROUGHNESS_GRID, Profile, choose_kinds
 from tests.errors import misset, refused
 from tests.unit.planted_fit import problem_of
 from workflow.decisions import materials
+from workflow.fitting import asked
 from workflow.registry import STAGES
 from workflow.scene.named import object_number
 from workflow.settings.scene import SceneSettings
-from workflow.stages import affines
 
 NAN = np.nan
 NAMES = ["floor", "window frame", "door"]
@@ -87,15 +87,15 @@ def test_kinds_are_chosen_among_those_that_agree_with_what_is_given():
 
 
 def job_of(monkeypatch, lobes=True, **entries):
-    monkeypatch.setattr(affines, "has_lobes", lambda job: lobes)
+    monkeypatch.setattr(asked, "has_lobes", lambda job: lobes)
     rows = {key: SimpleNamespace(**{"roughness": None, "metallic": None, **value}) for key, value in entries.items()}
     return SimpleNamespace(scene="kitchen", settings=SimpleNamespace(overrides=SimpleNamespace(**rows)))
 
 
 def test_objects_are_named_by_name_or_id(monkeypatch):
-    given = affines._given(job_of(monkeypatch, **{"window frame": {"metallic": 0.0}, "2": {"roughness": 0.6}}), NAMES)
+    given = asked.given_materials(job_of(monkeypatch, **{"window frame": {"metallic": 0.0}, "2": {"roughness": 0.6}}), NAMES)
     assert np.isnan(given[0]).all() and given[1, 1] == 0 and np.isnan(given[1, 0]) and given[2, 0] == 0.6
-    assert affines._given(job_of(monkeypatch), NAMES) is None
+    assert asked.given_materials(job_of(monkeypatch), NAMES) is None
     assert materials.given_words(3, given) == ["", "metallic", "roughness"]
     record = materials.given_by_hand(NAMES, given)
     assert record["status"] == "forced" and "window frame (metallic); door (roughness)" in record["reason"]
@@ -112,7 +112,7 @@ def test_objects_are_named_by_name_or_id(monkeypatch):
 )
 def test_what_cannot_be_given_is_said(monkeypatch, entries, lobes, names):
     with refused("config/scenes/kitchen.yaml", "overrides", *names):
-        affines._given(job_of(monkeypatch, lobes, **entries), NAMES)
+        asked.given_materials(job_of(monkeypatch, lobes, **entries), NAMES)
 
 
 def test_equal_names_need_the_id():

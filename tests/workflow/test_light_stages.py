@@ -13,6 +13,7 @@ from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, Room, StubJob, bu
 from lab.simulated.photographs import response_curve
 from tests.errors import refused
 from workflow.artifacts import files
+from workflow.fitting import asked
 from workflow.registry import STAGES
 from workflow.scene import emission_views
 from workflow.scene.base_scene import read_base_scene
@@ -301,7 +302,7 @@ def test_known_scale_of_a_lamp_and_of_a_patch(hdr):
 
     def gauge(**scale):
         job.settings.affines.scale = SimpleNamespace(**{**known.__dict__, **scale})
-        return affines._gauge(job, reader, list(room.names))
+        return asked.find_gauge(job, reader, list(room.names))
 
     found = float(radiance[np.flatnonzero(table["emitter_id"] == lamp)[0]].mean())
     got = gauge(lamp=SimpleNamespace(emitter_id=lamp, radiance=(2 * found,) * 3))(None, None)

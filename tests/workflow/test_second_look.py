@@ -8,10 +8,11 @@ from light_room import AFFINES, EMISSION, SHADING, StubJob, build
 
 from iif_core.fitting.predictions import PredictionErrors
 from workflow.artifacts.store import StageWriter
+from workflow.fitting.inputs import prediction_errors
 from workflow.scene.base_scene import SECOND_LOOK, read_base
 from workflow.scene.normal_form import CaptureReader
 from workflow.settings.base import Base
-from workflow.stages import affines, base, second_look
+from workflow.stages import base, second_look
 
 LEARNED = {"kind": "learned", "samples": 2, "seed": None, "device": "cpu"}
 MADE = {"base.json", "cells.parquet", "objects.parquet", "segments.parquet", "selection.parquet"}
@@ -98,9 +99,9 @@ def test_the_fit_is_told_that_the_second_base_errs_less(lit, tmp_path):
     prior.json("model.json", {"object_errors": stated})
     prior.finish()
     look(folder, enabled=False)
-    plain = affines._prediction_errors(StubJob("affines", folder, {}))
+    plain = prediction_errors(StubJob("affines", folder, {}))
     look(folder)
-    again = affines._prediction_errors(StubJob("affines", folder, {}))
+    again = prediction_errors(StubJob("affines", folder, {}))
     assert plain == PredictionErrors.from_facts(stated, "here")
     assert 0 < again.brightness < plain.brightness and again.level == plain.level and again.metal == plain.metal
 

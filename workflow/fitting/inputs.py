@@ -6,8 +6,10 @@ import numpy as np
 
 from iif_core.camera.gains import CameraGains
 from iif_core.camera.pixels import pixel_gains
+from iif_core.fitting.predictions import PredictionErrors
 from workflow.artifacts.store import ids_from_disk
 from workflow.runtime.job import Job
+from workflow.scene.base_scene import read_base
 from workflow.scene.normal_form import CaptureReader, View
 
 
@@ -48,3 +50,13 @@ def balanced(light: np.ndarray, balance: np.ndarray | None) -> np.ndarray:
     if balance is None:
         return light
     return light * balance.reshape(len(balance), *[1] * (light.ndim - 2), 3).astype(light.dtype)
+
+
+def prediction_errors(job: Job) -> PredictionErrors | None:
+    """Return how the predictions err, where the prior states it."""
+    prior = job.read("prior")
+    stated = prior.json("model.json").get("object_errors") if prior.has("model.json") else None
+    if stated is None:
+        return None
+    errors = PredictionErrors.from_facts(stated, str(prior.path("model.json")))
+    return errors.of_second_look() if read_base(job).stage == "second_look" else errors
