@@ -23,7 +23,7 @@ class DecodedView(NamedTuple):
     interior: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ViewPixels:
     """The pixels of one view that hit the mesh, in reading order; n pixels.
 
@@ -74,17 +74,17 @@ def pixels_of_view(view: View, decoded: DecodedView, normals: np.ndarray, among:
     normals, front = towards_viewer(normals[face].astype(np.float32), wo)
     value = photo.reshape(-1, 3)[hit]
     return ViewPixels(
-        hit,
-        points,
-        normals.astype(np.float32),
-        wo.astype(np.float32),
-        face,
-        object_id.ravel()[hit],
-        front,
-        value,
-        valid.ravel()[hit] & np.isfinite(value).all(1),
-        interior.ravel()[hit],
-        ((hit + view.view_id * 0x9E3779B1) & 0xFFFFFFFF).astype(np.uint32),
+        index=hit,
+        points=points,
+        normals=normals.astype(np.float32),
+        wo=wo.astype(np.float32),
+        face=face,
+        object_id=object_id.ravel()[hit],
+        from_front=front,
+        value=value,
+        valid=valid.ravel()[hit] & np.isfinite(value).all(1),
+        interior=interior.ravel()[hit],
+        number=((hit + view.view_id * 0x9E3779B1) & 0xFFFFFFFF).astype(np.uint32),
     )
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from iif_core.light.transport.materials import CellMaterials
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BaseScene:
     """The mesh with the base texture; ids are int32 with -1 = none, lengths metres, colours linear.
 

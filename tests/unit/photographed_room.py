@@ -43,9 +43,19 @@ def base_scene(room: Room) -> BaseScene:
     ijk = voxel_indices(middle, CELL, origin)
     first = np.unique(np.column_stack([ijk, room.object_id]), axis=0, return_index=True)[1]
     means = np.stack([room.material[room.object_id == o].mean(0) for o in range(count)]).astype(np.float32)
-    cells = ijk[first], room.object_id[first], room.material[first]
     return BaseScene(
-        room.vertices.astype(np.float32), room.faces, room.object_id, normals, areas, count, CELL, origin, *cells, means
+        vertices=room.vertices.astype(np.float32),
+        faces=room.faces,
+        object_id=room.object_id,
+        normals=normals,
+        areas=areas,
+        n_objects=count,
+        cell_edge=CELL,
+        cell_origin=origin,
+        cell_ijk=ijk[first],
+        cell_object=room.object_id[first],
+        cell_values=room.material[first],
+        object_values=means,
     )
 
 

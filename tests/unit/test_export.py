@@ -89,22 +89,30 @@ def room(lamp=(9.0, 6.0, 3.0), environment=(0, 0, 0), lamp_side=1):
     emitter = np.where(emits, 0, -1).astype(np.int32)
     origin = np.array([-0.5, -0.5, -0.525])  # the floor lies in the middle of a layer of cells
     surface = BaseScene(
-        vertices,
-        faces,
-        object_id,
-        *face_geometry(vertices, faces),
-        3,
-        0.05,
-        origin,
-        voxel_indices(floor, 0.05, origin),
-        np.zeros(len(floor), np.int32),
-        values,
-        np.array([[0.5, 0.5, 0.5, 0.9, 0], [0.8, 0.8, 0.8, 0.3, 0], [0, 0, 0, 1, 0]], np.float32),
+        vertices=vertices,
+        faces=faces,
+        object_id=object_id,
+        **dict(zip(("normals", "areas"), face_geometry(vertices, faces), strict=True)),
+        n_objects=3,
+        cell_edge=0.05,
+        cell_origin=origin,
+        cell_ijk=voxel_indices(floor, 0.05, origin),
+        cell_object=np.zeros(len(floor), np.int32),
+        cell_values=values,
+        object_values=np.array([[0.5, 0.5, 0.5, 0.9, 0], [0.8, 0.8, 0.8, 0.3, 0], [0, 0, 0, 1, 0]], np.float32),
     )
     radiance = np.where(emits[:, None], np.float32(lamp), 0).astype(np.float32)
     light = Light(radiance, np.where(emits, lamp_side, 0).astype(np.int8), emits, np.array(environment, np.float32))
     names = ["walls", "white <box>", "lamp"]
-    return Recovered(surface, names, floor.astype(np.float32), light, emitter, np.array([lamp], np.float32), 1.0)
+    return Recovered(
+        surface=surface,
+        object_names=names,
+        cell_centres=floor.astype(np.float32),
+        light=light,
+        emitter_id=emitter,
+        emitter_radiance=np.array([lamp], np.float32),
+        light_scale=1.0,
+    )
 
 
 def seen(scene, front=(0, 50, 0), back=(100, 0, 0)):
@@ -403,11 +411,28 @@ def test_a_simplified_ball_looks_round_by_its_normal_map(tmp_path):
     count = len(ball.faces)
     empty, values = np.zeros(0, np.int32), np.array([[0.5, 0.5, 0.5, 0.9, 0]], np.float32)
     surface = BaseScene(
-        np.float32(ball.vertices), np.int32(ball.faces), np.zeros(count, np.int32), *face_geometry(ball.vertices, ball.faces), 1,
-        0.05, np.full(3, -2.0), np.zeros((0, 3), np.int32), empty, np.zeros((0, 5), np.float32), values,
-    )  # fmt: skip
+        vertices=np.float32(ball.vertices),
+        faces=np.int32(ball.faces),
+        object_id=np.zeros(count, np.int32),
+        **dict(zip(("normals", "areas"), face_geometry(ball.vertices, ball.faces), strict=True)),
+        n_objects=1,
+        cell_edge=0.05,
+        cell_origin=np.full(3, -2.0),
+        cell_ijk=np.zeros((0, 3), np.int32),
+        cell_object=empty,
+        cell_values=np.zeros((0, 5), np.float32),
+        object_values=values,
+    )
     dark = Light(np.zeros((count, 3), np.float32), np.zeros(count, np.int8), np.zeros(count, bool), np.zeros(3, np.float32))
-    scene = Recovered(surface, ["ball"], np.zeros((0, 3), np.float32), dark, np.full(count, -1, np.int32), np.zeros((0, 3)), 1.0)
+    scene = Recovered(
+        surface=surface,
+        object_names=["ball"],
+        cell_centres=np.zeros((0, 3), np.float32),
+        light=dark,
+        emitter_id=np.full(count, -1, np.int32),
+        emitter_radiance=np.zeros((0, 3)),
+        light_scale=1.0,
+    )
     (coarse,) = build_parts(seen(scene, front=(9,), back=(0,)), 200)
     made = unwrap([(coarse.vertices, coarse.faces)], [200.0], 512)
     xyz, normals = (a[made.source[0]].astype(np.float32) for a in (coarse.vertices, coarse.normals))

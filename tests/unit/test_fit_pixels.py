@@ -23,7 +23,17 @@ def _pixels(seed=0, n=20_000):
     face, way = rng.integers(0, 10, n).astype(np.int32), np.zeros((n, 3), np.float32)
     valid, front = rng.random(n) < 0.95, np.ones(n, bool)
     return ViewPixels(
-        np.arange(n), way, way, way, face, owner.astype(np.int32), front, way, valid, interior, np.arange(n, dtype=np.uint32)
+        index=np.arange(n),
+        points=way,
+        normals=way,
+        wo=way,
+        face=face,
+        object_id=owner.astype(np.int32),
+        from_front=front,
+        value=way,
+        valid=valid,
+        interior=interior,
+        number=np.arange(n, dtype=np.uint32),
     )
 
 

@@ -58,9 +58,19 @@ def surface(parts):
     empty = np.zeros((0, 3), np.int32)
     faces = sum(len(one.faces) for one in parts)
     return BaseScene(
-        np.zeros((0, 3)), empty, np.zeros(0), np.zeros((0, 3)), np.zeros(faces), 3, 0.05, np.zeros(3), empty,
-        np.zeros(0, np.int32), np.zeros((0, 5), np.float32), values,
-    )  # fmt: skip
+        vertices=np.zeros((0, 3)),
+        faces=empty,
+        object_id=np.zeros(0),
+        normals=np.zeros((0, 3)),
+        areas=np.zeros(faces),
+        n_objects=3,
+        cell_edge=0.05,
+        cell_origin=np.zeros(3),
+        cell_ijk=empty,
+        cell_object=np.zeros(0, np.int32),
+        cell_values=np.zeros((0, 5), np.float32),
+        object_values=values,
+    )
 
 
 def test_every_emitter_is_a_lamp_up_to_sixteen():

@@ -47,18 +47,18 @@ def read_base_scene(job: Job) -> BaseScene:
     object_values[means["object_id"][seen]] = _rows(means)[seen]
     normals, areas = face_geometry(vertices, faces)
     return BaseScene(
-        vertices,
-        faces,
-        object_id,
-        normals,
-        areas,
-        n_objects,
-        float(facts["cell_edge_m"]),
-        np.asarray(facts["origin"], np.float32),
-        np.stack([cells[c] for c in "ijk"], 1).astype(np.int32),
-        cells["object_id"].astype(np.int32),
-        _rows(cells),
-        object_values,
+        vertices=vertices,
+        faces=faces,
+        object_id=object_id,
+        normals=normals,
+        areas=areas,
+        n_objects=n_objects,
+        cell_edge=float(facts["cell_edge_m"]),
+        cell_origin=np.asarray(facts["origin"], np.float32),
+        cell_ijk=np.stack([cells[c] for c in "ijk"], 1).astype(np.int32),
+        cell_object=cells["object_id"].astype(np.int32),
+        cell_values=_rows(cells),
+        object_values=object_values,
     )
 
 

@@ -16,7 +16,7 @@ from workflow.scene.base_scene import read_base, read_lit_scene
 from workflow.scene.named import object_names
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Recovered:
     """Geometry, fitted materials and light; ids are int32 with -1 = none, lengths metres, colours linear.
 
@@ -74,13 +74,13 @@ def read_recovered(job: Job) -> Recovered:
     radiance = np.zeros((int(emitters["emitter_id"].max(initial=-1)) + 1, 3), np.float32)
     radiance[emitter_id[light.emits]] = light.radiance[light.emits]
     return Recovered(
-        replace(base, cell_values=cell_values, object_values=object_values),
-        names,
-        np.stack([cells[c] for c in "xyz"], 1).astype(np.float32),
-        light,
-        emitter_id,
-        radiance,
-        scale,
+        surface=replace(base, cell_values=cell_values, object_values=object_values),
+        object_names=names,
+        cell_centres=np.stack([cells[c] for c in "xyz"], 1).astype(np.float32),
+        light=light,
+        emitter_id=emitter_id,
+        emitter_radiance=radiance,
+        light_scale=scale,
     )
 
 

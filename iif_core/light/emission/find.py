@@ -31,7 +31,7 @@ from iif_core.light.emission.sun import SunEvidence
 from iif_core.light.emission.sun_search import find_sun
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FirstLook:
     """What may shine, and what rays meet that leave the surface.
 
@@ -53,7 +53,7 @@ class FirstLook:
     brightness: float | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FoundLight:
     """All light of a scene under one assumption about which surface lets light through.
 
@@ -114,7 +114,16 @@ def look_around(photos: Photographs, adjacency: np.ndarray) -> FirstLook:
     photos.log.say(f"{candidate.sum()} candidate faces in {groups.size} groups ({len(groups.dropped)} left out)")
     sky, primary, brightness = escaping_light(photos)
     met = rays_from_surface(photos)
-    return FirstLook(groups, threshold, glowing, sky, met, primary, float((met < 0).mean()), brightness)
+    return FirstLook(
+        groups=groups,
+        threshold=threshold,
+        glowing=glowing,
+        sky=sky,
+        met=met,
+        primary=primary,
+        secondary=float((met < 0).mean()),
+        brightness=brightness,
+    )
 
 
 def find_light(photos: Photographs, look: FirstLook, environment: bool, is_open: bool) -> FoundLight:
@@ -157,5 +166,17 @@ def find_light(photos: Photographs, look: FirstLook, environment: bool, is_open:
         found = traced(photos, unseen, found.groups.select(~weak), outside, threshold)
         found, solution, loss = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
     gain = reliable(found.gains) if len(found.prior.initial) else gain  # without emitters those of the trial stay
-    left_out, why = groups.select(reasons != ""), [reason for reason in reasons if reason]
-    return FoundLight(photos, look, found, solution, loss, left_out, why, gain, outside, sun, hidden, notes)
+    return FoundLight(
+        photos=photos,
+        look=look,
+        found=found,
+        solution=solution,
+        loss=loss,
+        left_out=groups.select(reasons != ""),
+        reasons=[reason for reason in reasons if reason],
+        gain=gain,
+        outside=outside,
+        sun=sun,
+        hidden=hidden,
+        notes=notes,
+    )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EmissionOptions:
     """How the light of a scene is looked for (`workflow/settings/light.py` explains each).
 

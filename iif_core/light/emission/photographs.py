@@ -37,7 +37,7 @@ COVERAGE_GRID = 6
 SEEDS = 0x656D69  # keeps these random streams apart from those of other stages
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ViewRecord:
     """Everything that is read of one view, decoded.
 
@@ -117,7 +117,7 @@ class Records(Protocol):
     def __getitem__(self, view: View) -> ViewRecord: ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Photographs:
     """The views that are used, and what turns them into radiance."""
 
