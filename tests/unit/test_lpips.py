@@ -158,8 +158,8 @@ def test_vgg_layers_by_shape(vgg):
 
 def test_stage_scores_what_is_looked_at_with_the_learned_metrics(alex, vgg):
     """VGG: albedo of result, base and first prediction, raw and scaled; the result alone has AlexNet everywhere."""
-    from workflow.scoring.scores import MaterialTruth
     from workflow.scoring.of_views import _scores
+    from workflow.scoring.scores import MaterialTruth
 
     truth, mask, objects = image(1), np.ones(image(1).shape[:2], bool), np.zeros(image(1).shape[:2], int)
     maps = {"albedo": image(2), "roughness": image(2)[..., 0], "metallic": image(2)[..., 1]}
