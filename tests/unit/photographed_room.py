@@ -60,7 +60,7 @@ def base_scene(room: Room) -> BaseScene:
 
 
 def photographed(
-    room: Room, views: int = 4, size: int = 24, samples: int = 32, sky: float = 0.0, edit: Callable | None = None
+    room: Room, views: int = 4, size: int = 24, samples: int = 32, sky: float = 0.0
 ) -> tuple[Photographs, list[str]]:
     """Linear photographs of a room under its light, and the list that fills with what is said about them."""
     from iif_core.light.transport.emitters import Emitters
@@ -79,7 +79,6 @@ def photographed(
         origin, rays = view.world_from_camera[:3, 3], view.directions().reshape(-1, 3)
         face, depth = trace(scanned, origin, rays)
         photo = render(world, origin, rays, PathOptions(samples, 10, 1000 + view.view_id)).reshape(size, size, 3)
-        photo = photo if edit is None else edit(view, photo)
         met = face.reshape(size, size)
         objects = np.where(met >= 0, room.object_id[met], -1)
         inner = np.ones((size, size), bool)
