@@ -10,6 +10,7 @@ KINDS = {
 SECTIONS = {"scene": "lab.settings.scene:LabScene"}
 ADDED = {
     "relit_truth": {
+        "does": "Render the source of a scene with truth under new light; made on demand by studies.",
         "place": "lab.relit.truth",
         "upstream": ("capture",),
         "settings": ("source", "relit", "seed"),
@@ -17,6 +18,7 @@ ADDED = {
         "files": ("lab.relit.sources",),
     },
     "relit_scores": {
+        "does": "Render the result under new light and score it against the source; made on demand by studies.",
         "place": "lab.relit.scores",
         "upstream": ("capture", "segmentation", "base", "emission", "second_look", "affines", "relit_truth"),
         "settings": ("relit", "seed"),

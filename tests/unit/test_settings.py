@@ -86,13 +86,10 @@ def test_scene_over_preset_over_default(scene):
         (GOOD + "affines: {VIEWS: 3}\n", ["affines.VIEWS", "batch, epochs, iterations"]),
         (GOOD + "colour: 3\n", ["colour", "affines, base, capture"]),
         (
-            GOOD + "override: {window frame: {metallic: 0}}\n",
-            ["override.window frame", "`overrides`", "components"],
+            GOOD + "override: {components: {specular: off}}\n",
+            ["override", "`components`"],
         ),
-        (
-            GOOD + "overrides: {components: {specular: off}}\n",
-            ["overrides.components.specular", "`override`", "metallic"],
-        ),
+        (GOOD + "overrides: {window frame: {metallic: 0}}\n", ["overrides", "`materials`"]),
         (GOOD + "capture: {views: 0}\n", ["capture.views", 0, 1]),
         (GOOD + "capture: {dynamic_range: mdr}\n", ["capture.dynamic_range", "'mdr'", "'ldr' or 'hdr'"]),
         ("source: {kind: builtin}\nprior: {kind: simulated, samples: 0}\n", ["prior.samples", 0, 1]),
@@ -218,14 +215,9 @@ def test_unknown_scene_suggests(scene):
         settings.load("xx", "draft", root)
 
 
-def test_shipped_scenes_and_studies_load_at_every_quality(repository):
-    for quality in settings.QUALITIES:
-        for name in settings.scene_names(repository):
-            settings.load(name, quality, repository)
-        for name in study_files.study_names(repository):
-            study = study_files.load_study(name, repository)
-            for scene, variant in itertools.product(study.scenes, study.variants):
-                settings.load(study_files.scene_of(name, scene, variant, 0), quality, repository)
+def test_shipped_scenes_load_at_every_quality(repository):
+    for quality, name in itertools.product(settings.QUALITIES, settings.scene_names(repository)):
+        settings.load(name, quality, repository)
 
 
 def test_the_kitchen_can_be_relit_as_it_is_shipped(repository):
@@ -314,21 +306,21 @@ def test_yaml_is_read_alike_with_and_without_libyaml(tmp_path, monkeypatch):
     ],
 )
 def test_a_forced_component_is_the_setting_of_its_own(scene, words, section, key, value):
-    found = settings.load("x", "draft", scene(f"{GOOD}override: {{components: {{{words}}}}}\n"))
+    found = settings.load("x", "draft", scene(f"{GOOD}components: {{{words}}}\n"))
     assert getattr(getattr(found, section), key) == value
 
 
 @pytest.mark.parametrize(
     ("text", "names"),
     [
-        ("override: {components: {environment: off}}\nemission: {environment: on}", ["override", "emission: environment: on"]),
-        ("override: {components: {denoiser: on}}\nrender: {denoise: false}", ["override", "render: denoise: False"]),
-        ("override: {components: {metallic: on}}", ["override.components.metallic", "'on'", "'auto' or 'off'"]),
-        ("override: {components: {gloss: off}}", ["override.components.gloss", "specular"]),
-        ("override: {components: {specular: maybe}}", ["override.components.specular", "'maybe'", "'auto', 'on' or 'off'"]),
+        ("components: {environment: off}\nemission: {environment: on}", ["components", "emission: environment: on"]),
+        ("components: {denoiser: on}\nrender: {denoise: false}", ["components", "render: denoise: False"]),
+        ("components: {metallic: on}", ["components.metallic", "'on'", "'auto' or 'off'"]),
+        ("components: {gloss: off}", ["components.gloss", "specular"]),
+        ("components: {specular: maybe}", ["components.specular", "'maybe'", "'auto', 'on' or 'off'"]),
         (
-            "capture: {dynamic_range: ldr}\npreset: published\noverride: {components: {specular: off}}",
-            ["override: components: specular"],
+            "capture: {dynamic_range: ldr}\npreset: published\ncomponents: {specular: off}",
+            ["components: specular"],
         ),
     ],
 )
@@ -354,11 +346,11 @@ def test_limits_of_a_scene_hold_for_every_quality_and_raise_nothing(repository, 
 @pytest.mark.parametrize(
     ("draft", "names"),
     [
-        ("point: draft\n", ["point", "'draft'", "p01"]),
-        ("point: nowhere\n", ["point", "'nowhere'", "p01"]),
-        ("point: [p01]\n", ["point", "['p01']"]),
+        ("quality: draft\n", ["quality", "'draft'", "p01"]),
+        ("quality: nowhere\n", ["quality", "'nowhere'", "p01"]),
+        ("quality: [p01]\n", ["quality", "['p01']"]),
         ("capture: {veiws: 3}\n", ["capture.veiws", "`views`"]),
-        ("point: p01\nmetrics: {veiws: 3}\n", ["metrics.veiws", "`views`"]),
+        ("quality: p01\nmetrics: {veiws: 3}\n", ["metrics.veiws", "`views`"]),
     ],
 )
 def test_mistakes_in_a_quality_are_blamed_on_its_file(tmp_path, draft, names):
@@ -375,11 +367,11 @@ def test_a_quality_may_be_a_point_with_a_change_and_a_point_alone_is_known_by_it
         (tmp_path / "config" / part).mkdir(parents=True)
     (tmp_path / "config/scenes/t.yaml").write_text("source: {kind: builtin, scene: tiny}\nprior: {kind: simulated}\n")
     (tmp_path / "config/quality/p91.yaml").write_text("capture: {views: 9, width: 90}\nprior: {samples: 3}\n")
-    (tmp_path / "config/quality/draft.yaml").write_text("point: p91\ncapture: {views: 7}\n")
+    (tmp_path / "config/quality/draft.yaml").write_text("quality: p91\ncapture: {views: 7}\n")
     found = settings.load("t", "draft", tmp_path)
     assert (found.capture.views, found.capture.width, found.prior.samples) == (7, 90, 3)
     assert loading.canonical("p91", tmp_path) == "p91"
-    (tmp_path / "config/quality/draft.yaml").write_text("point: p91\n")
+    (tmp_path / "config/quality/draft.yaml").write_text("quality: p91\n")
     assert loading.canonical("p91", tmp_path) == "draft" and loading.canonical("paper", tmp_path) == "paper"
     assert loading.overridden("t", "p91", tmp_path) == []
     (tmp_path / "config/scenes/t.yaml").write_text("source: {kind: builtin, scene: tiny}\nprior: {kind: simulated, samples: 5}\n")
@@ -399,25 +391,6 @@ def test_a_bench_of_a_scene_that_is_not_there_says_so(tmp_path):
 def test_a_comparison_needs_two_names(repository):
     with refused("compare/kitchen", "compare/kitchen,country-kitchen"):
         settings.refuse_target("compare/kitchen", [], repository)
-
-
-def test_a_workflow_profile_that_is_not_there_is_refused(repository, tmp_path):
-    """Snakemake passes over it, and runs with the settings of none."""
-    for given in ("none", "default", "workflow/profiles/slurm-scenes", "workflow/profiles/slurm/config.yaml"):
-        settings.refuse_profile(given, repository, repository)
-    settings.refuse_profile(str(repository / "workflow/profiles/slurm"), tmp_path, repository)
-    with refused("--workflow-profile workflow/profiles/slurm-scene", "workflow/profiles/slurm-scenes"):
-        settings.refuse_profile("workflow/profiles/slurm-scene", repository, repository)
-    with refused("--workflow-profile workflow/profiles/slurm", tmp_path, repository / "workflow/profiles/slurm-scenes"):
-        settings.refuse_profile("workflow/profiles/slurm", tmp_path, repository)
-
-
-def test_a_name_that_nothing_is_scattered_by_is_refused():
-    settings.refuse_scatter({"prior": 8}, ("prior",))
-    with refused("--set-scatter prior=0", 1):
-        settings.refuse_scatter({"prior": 0}, ("prior",))
-    with refused("--set-scatter piror", "prior"):
-        settings.refuse_scatter({"piror": 8}, ("prior",))
 
 
 def test_the_profiles_of_slurm_know_every_stage(repository):

@@ -309,7 +309,7 @@ def _write_objects(job: Job, scene: BaseScene, result: _Result, model: str) -> N
     zeros = np.zeros(len(names))
     columns |= {"std_level": zeros, "covariance_trace": zeros, "residual": zeros, "light_gain": 1.0 + zeros}
     columns["model"] = np.array([MODEL_NAMES[model]] * len(names), dtype=str)
-    columns["given"] = np.array([""] * len(names), dtype=str)  # `overrides` needs the model of objects
+    columns["given"] = np.array([""] * len(names), dtype=str)  # `materials` needs the model of objects
     job.writer.table("objects.parquet", columns, {"residual": "sensor value"})
 
 

@@ -23,7 +23,7 @@ from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter, links, stamps
 from workflow.artifacts.files import read_record, write_json
 from workflow.registry import SHARED, STAGES
-from workflow.runtime import device, events, forecast
+from workflow.runtime import device, forecast
 from workflow.runtime import fingerprint as fp
 from workflow.settings import study_files
 
@@ -232,9 +232,6 @@ class Job:
         since = (now - then) / (done - done_first) if done > done_first else 0.0
         left = f", about {since * (total - done):.0f} s left" if since and done < total else ""
         self.log.info("%s: %d of %d (%.0f s%s)", what, done, total, spent, left)
-        if events.due():
-            facts = {"what": what, "done": done, "total": total, "seconds": round(spent, 3)}
-            events.tell("progress", self.scene, self.name, self.fingerprint, **facts)
 
 
 def library_versions() -> dict[str, str]:

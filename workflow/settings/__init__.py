@@ -15,7 +15,7 @@ from workflow.settings.relight import relight_files, require_relighting
 from workflow.settings.relight_plans import active_plan, plan_names
 from workflow.settings.scene import UNIONS, SceneSettings, dump, recorded, select
 from workflow.settings.section import Section
-from workflow.settings.targets import refuse_profile, refuse_scatter, refuse_target
+from workflow.settings.targets import refuse_target
 from workflow.settings.yaml_file import read_yaml
 
 __all__ = [
@@ -33,8 +33,6 @@ __all__ = [
     "recorded",
     "plan_schema_json",
     "reference_markdown",
-    "refuse_profile",
-    "refuse_scatter",
     "refuse_target",
     "relight_files",
     "relight_origin",

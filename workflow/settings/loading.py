@@ -163,20 +163,20 @@ def _blamed(place: str, layers: Layers, dotted: str) -> str:
 
 
 def _quality(quality: str, root: Path) -> dict[str, Any]:
-    """Return the settings of a quality; where its file names a `point`, those of the point with its own over them."""
+    """Return the settings of a quality; where its file names another `quality`, those of that one with its own over them."""
     names = quality_names(root)
     if quality not in names:
         hint = did_you_mean(quality, names)
         raise InputError(f"--config quality={quality}: unknown quality.{hint} Allowed: {', '.join(names)}")
     settings = read_yaml(configuration(f"quality/{quality}.yaml", root))
-    if "point" not in settings:
+    if "quality" not in settings:
         return settings
-    point, own = settings["point"], {key: value for key, value in settings.items() if key != "point"}
-    below = read_yaml(configuration(f"quality/{point}.yaml", root)) if point in names else {"point": None}
-    if "point" in below:
+    other, own = settings["quality"], {key: value for key, value in settings.items() if key != "quality"}
+    below = read_yaml(configuration(f"quality/{other}.yaml", root)) if other in names else {"quality": None}
+    if "quality" in below:
         raise InputError(
-            f"config/quality/{quality}.yaml: `point`: found {point!r}; needed is the name of a file next to it that has no"
-            " `point` itself, such as p01"
+            f"config/quality/{quality}.yaml: `quality`: found {other!r}; needed is the name of a file next to it that names no"
+            " `quality` itself, such as p01"
         )
     return merge(below, own)
 
@@ -239,7 +239,7 @@ def photographs(quality: str, root: Path = Path(".")) -> str:
 def canonical(quality: str, root: Path = Path(".")) -> str:
     """Return the name under which a quality is run: a point that is all of a named quality has that name."""
     for name in QUALITIES:
-        if read_yaml(configuration(f"quality/{name}.yaml", root)) == {"point": quality}:
+        if read_yaml(configuration(f"quality/{name}.yaml", root)) == {"quality": quality}:
             return name
     return quality
 

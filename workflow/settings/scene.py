@@ -10,9 +10,9 @@ from pydantic import Field, field_validator, model_validator
 from workflow import plugins
 from workflow.settings import affines, base, light, outputs
 from workflow.settings.affines import FREE_CELLS, textures_cells
+from workflow.settings.by_hand import ByObject, Components
 from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES, PUBLISHED
 from workflow.settings.limits import Limits
-from workflow.settings.override import ByObject, Override
 from workflow.settings.prior import LearnedPrior, Member, Prior, predictions
 from workflow.settings.relight import Relightings, lamp_bases, recombines
 from workflow.settings.section import Section
@@ -66,9 +66,9 @@ class SceneSettings(Section):
     export: Export = Export()
     report: Report = Report()
     room: Room = Room()
-    override: Override = Override()
+    components: Components = Components()
     """Parts of the model that are forced in or out, in the words of plan.yaml."""
-    overrides: ByObject = Field(default_factory=dict)
+    materials: ByObject = Field(default_factory=dict)
     """Corrections by hand: name or id of an object -> its `roughness`, `metallic` or both, which are then not fitted
     (docs/guide/relighting.md#corrections-by-hand)."""
     relight_title: str = ""
@@ -119,17 +119,17 @@ class SceneSettings(Section):
     @model_validator(mode="after")
     def _overridden(self) -> SceneSettings:
         """Put components that are forced, and have a setting of their own, in the place of that setting."""
-        choice = self.override.components
+        choice = self.components
         forced = {name: value for name, value in choice.model_dump().items() if value != "auto"}
         published = self.emission.solver in PUBLISHED or self.shading.method == "published"
         if forced and (self.preset != "ours" or published):
-            raise ValueError(f"`override: components: {', '.join(forced)}`: the published method has no plan; remove it")
+            raise ValueError(f"`components: {', '.join(forced)}`: the published method has no plan; remove it")
         fits_both = self.affines.model == "objects" and self.affines.solver == "direct"
         for component in ("specular", "metallic"):
             if forced.get(component) == "off" and not fits_both:
-                raise ValueError(f"`override: components: {component}: off`: needs `affines: {{model: objects, solver: direct}}`")
-        if self.overrides and not (fits_both and self.preset == "ours"):
-            raise ValueError("`overrides`: materials given by hand need `affines: {model: objects, solver: direct}`; remove them")
+                raise ValueError(f"`components: {component}: off`: needs `affines: {{model: objects, solver: direct}}`")
+        if self.materials and not (fits_both and self.preset == "ours"):
+            raise ValueError("`materials`: those given by hand need `affines: {model: objects, solver: direct}`; remove them")
         own = {
             "environment": ("emission", "environment", {"on": "on", "off": "off"}),
             "radiance_cache": ("shading", "indirect", {"on": "cache", "off": "path"}),
@@ -140,7 +140,7 @@ class SceneSettings(Section):
                 part, value = getattr(self, section), values[forced[component]]
                 if key in part.model_fields_set and getattr(part, key) not in (value, "auto"):
                     raise ValueError(
-                        f"`override: components: {component}: {forced[component]}` contradicts"
+                        f"`components: {component}: {forced[component]}` contradicts"
                         f" `{section}: {key}: {getattr(part, key)}`; remove one of the two"
                     )
                 object.__setattr__(self, section, part.model_copy(update={key: value}))

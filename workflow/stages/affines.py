@@ -69,7 +69,7 @@ def run(job: Job) -> None:
     albedo = textures.albedo(fit) if textures is not None else None
     _write_cells(job, fit, albedo)
     _write_maps(job, capture, fit, albedo)
-    metals = job.settings.override.components.metallic
+    metals = job.settings.components.metallic
     plan = _plan(problem, fit, calibration, capture.facts["dynamic_range"], metals)
     if given is not None:
         plan.append(materials.given_by_hand(names, given))
@@ -103,7 +103,7 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Callable[[
             # This prior read the brightness of objects from the same photographs.
             base_tells_levels=job.settings.prior.kind != "retinex",
             lobes=has_lobes(job),
-            metals=job.settings.override.components.metallic != "off",
+            metals=job.settings.components.metallic != "off",
             prediction_errors=_prediction_errors(job),
             threads=job.threads,
         )
@@ -230,19 +230,19 @@ def _lamp_gauge(job: Job, lamp: KnownLamp) -> Callable[[FitProblem, _Places], Ga
 
 
 def _given(job: Job, names: list[str]) -> np.ndarray | None:
-    """Return roughness and metallic (O, 2) that `overrides` gives, NaN = fitted; None if it gives nothing.
+    """Return roughness and metallic (O, 2) that `materials` gives, NaN = fitted; None if it gives nothing.
 
     Raises:
         InputError: no object has this name or id, two entries mean the same object, or the model has no specular lobes.
     """
-    wanted: dict[str, Any] = vars(job.settings.overrides)
+    wanted: dict[str, Any] = vars(job.settings.materials)
     if not wanted:
         return None
-    where = f"{scene_origin(job.scene)}: `overrides`"
+    where = f"{scene_origin(job.scene)}: `materials`"
     if not has_lobes(job):
         raise InputError(
             f"{where}: found materials given by hand, but this scene is fitted without specular lobes, so they would change"
-            " nothing; set `override: {components: {specular: on}}`, or remove them"
+            " nothing; set `components: {specular: on}`, or remove them"
         )
     given = np.full((len(names), 2), np.nan)
     for key, entry in wanted.items():

@@ -18,6 +18,7 @@ from iif_core.light.emission.sensor import Sensor
 from iif_core.surface.segments import face_adjacency
 from workflow.decisions import light as decisions
 from workflow.decisions import numerics
+from workflow.decisions.plan import environment as from_outside
 from workflow.decisions.plan import included
 from workflow.decisions.record import SETTLED
 from workflow.runtime.job import Job
@@ -143,11 +144,11 @@ def _light(photos: Photographs, adjacency: np.ndarray) -> tuple[FoundLight, np.n
     sums, escape, brightness = escaping_light(photos)
     met = rays_from_surface(photos)
     secondary = float((met < 0).mean())
-    environment = decisions.environment(job.settings.emission.environment, escape, secondary, brightness)
     planned = included(job.read("plan").json("plan.json")["plan"], "environment")
     # Where light passes through surface, the mesh is another one than the plan was made for.
-    if planned["status"] == SETTLED and scene.transmittance is None:
-        environment = planned
+    is_planned = planned["status"] == SETTLED and scene.transmittance is None
+    setting = job.settings.emission.environment
+    environment = planned if is_planned else from_outside(setting, escape, secondary, brightness)
     is_open = secondary > decisions.ESCAPE_OPEN
     outside = (sums.directions() if is_open else sums.groups()) if environment["included"] else None
     notes: list[str] = []

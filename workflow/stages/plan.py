@@ -45,7 +45,7 @@ def _probed(job: Job, capture: CaptureReader) -> tuple[list[Decision], dict[str,
     plan = [
         decisions.environment(settings.emission.environment, *escape, rows.outside, light["environment"]),
         decisions.emitters(capture.is_hdr, light["emitters"]),
-        decisions.specular(settings.override.components.specular, gloss),
+        decisions.specular(settings.components.specular, gloss),
         decisions.radiance_cache(rows.photographed),
     ]
     facts = {

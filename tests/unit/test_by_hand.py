@@ -1,4 +1,4 @@
-"""Corrections by hand (`overrides`): given values stay exactly as they are, and everything else is still fitted."""
+"""Corrections by hand (`materials`): given values stay exactly as they are, and everything else is still fitted."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -89,7 +89,7 @@ def test_kinds_are_chosen_among_those_that_agree_with_what_is_given():
 def job_of(monkeypatch, lobes=True, **entries):
     monkeypatch.setattr(affines, "has_lobes", lambda job: lobes)
     rows = {key: SimpleNamespace(**{"roughness": None, "metallic": None, **value}) for key, value in entries.items()}
-    return SimpleNamespace(scene="kitchen", settings=SimpleNamespace(overrides=SimpleNamespace(**rows)))
+    return SimpleNamespace(scene="kitchen", settings=SimpleNamespace(materials=SimpleNamespace(**rows)))
 
 
 def test_objects_are_named_by_name_or_id(monkeypatch):
@@ -107,41 +107,41 @@ def test_objects_are_named_by_name_or_id(monkeypatch):
         ({"windw frame": {"metallic": 0.0}}, True, ["'windw frame'", "'window frame'"]),
         ({"7": {"metallic": 0.0}}, True, ["'7'", "floor, window frame, door"]),
         ({"door": {"metallic": 0.0}, "2": {"roughness": 0.5}}, True, ["'door'", 2]),
-        ({"door": {"metallic": 1.0}}, False, ["override: {components: {specular: on}}"]),
+        ({"door": {"metallic": 1.0}}, False, ["components: {specular: on}"]),
     ],
 )
 def test_what_cannot_be_given_is_said(monkeypatch, entries, lobes, names):
-    with refused("config/scenes/kitchen.yaml", "overrides", *names):
+    with refused("config/scenes/kitchen.yaml", "materials", *names):
         affines._given(job_of(monkeypatch, lobes, **entries), NAMES)
 
 
 def test_equal_names_need_the_id():
-    with refused("overrides", "'chair'", 2, "[0, 1]"):
-        object_number("chair", ["chair", "chair"], "overrides")
-    assert object_number("1", ["chair", "chair"], "overrides") == 1
-    assert object_number("1", ["wall", "floor", "1"], "overrides") == 2  # names come first
+    with refused("materials", "'chair'", 2, "[0, 1]"):
+        object_number("chair", ["chair", "chair"], "materials")
+    assert object_number("1", ["chair", "chair"], "materials") == 1
+    assert object_number("1", ["wall", "floor", "1"], "materials") == 2  # names come first
 
 
-def settings_of(overrides, **more):
-    tree = {"source": {"kind": "builtin", "scene": "kitchen"}, "prior": {"kind": "simulated"}, "overrides": overrides, **more}
+def settings_of(materials, **more):
+    tree = {"source": {"kind": "builtin", "scene": "kitchen"}, "prior": {"kind": "simulated"}, "materials": materials, **more}
     return SceneSettings.model_validate(tree)
 
 
 def test_settings_take_ids_and_refuse_the_rest():
-    assert settings_of({7: {"metallic": 0}, "door": {"roughness": 0.6}}).overrides["7"].metallic == 0
+    assert settings_of({7: {"metallic": 0}, "door": {"roughness": 0.6}}).materials["7"].metallic == 0
     for bad, *fault in (
-        ({"door": {}}, "overrides.door", "value_error", "roughness", "metallic"),
-        ({"door": {"roughness": 0}}, "overrides.door.roughness", "greater_than_equal", 0.02),
-        ({"door": {"metallic": 2}}, "overrides.door.metallic", "less_than_equal", 1),
-        ({"door": {"albedo": [1, 1, 1]}}, "overrides.door", "value_error", "albedo", "white_patch"),
-        ({"door": {"metalic": 1}}, "overrides.door.metalic", "extra_forbidden"),
+        ({"door": {}}, "materials.door", "value_error", "roughness", "metallic"),
+        ({"door": {"roughness": 0}}, "materials.door.roughness", "greater_than_equal", 0.02),
+        ({"door": {"metallic": 2}}, "materials.door.metallic", "less_than_equal", 1),
+        ({"door": {"albedo": [1, 1, 1]}}, "materials.door", "value_error", "albedo", "white_patch"),
+        ({"door": {"metalic": 1}}, "materials.door.metalic", "extra_forbidden"),
     ):
         with misset(*fault):
             settings_of(bad)
-    with misset("", "value_error", "overrides", "affines: {model: objects, solver: direct}"):
+    with misset("", "value_error", "materials", "affines: {model: objects, solver: direct}"):
         settings_of({"door": {"metallic": 0}}, affines={"model": "fipt"})
 
 
 def test_only_the_fit_and_what_follows_it_read_them():
-    readers = {name for name, stage in STAGES.items() if any(key.split(".")[0] == "overrides" for key in stage.settings)}
+    readers = {name for name, stage in STAGES.items() if any(key.split(".")[0] == "materials" for key in stage.settings)}
     assert readers == {"affines"}

@@ -8,9 +8,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from lab.costs.fit import fit_rows, write_fits
+from lab.costs.records import gather, read_rows, write_rows
 from workflow.costs.machine import SHORTEST
-from workflow.costs.model import MEASURES, SHIPPED, Fits, fit_rows, write_fits
-from workflow.costs.records import gather, read_rows, write_rows
+from workflow.costs.model import MEASURES, SHIPPED, Fits
 
 TABLE = Path("lab/notebook/data/costs.csv")
 """The rows that the shipped coefficients were fitted to."""
@@ -22,7 +23,7 @@ def refit(folders: Iterable[Path], table: Path = TABLE, fits: Path = SHIPPED, si
     Args:
         folders: like `results/`; with none, the table stays as it is. A job that the table has already is not added twice. All
             jobs of a folder are of one machine, whose factor is found by what the table says of such jobs.
-        table: CSV file of rows (`workflow.costs.records.write_rows`).
+        table: CSV file of rows (`lab.costs.records.write_rows`).
         fits: JSON file that is written.
         sizes: the jobs of the folders shared the machine with other jobs. Take their memory and disk, but take their times only
             for kinds of which the table has no times.

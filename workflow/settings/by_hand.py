@@ -1,4 +1,4 @@
-"""Settings that decide about parts of the model in the place of the plan."""
+"""What a person knows better: parts of the model that the plan is not to decide about, and materials of objects."""
 
 from __future__ import annotations
 
@@ -25,13 +25,6 @@ class Components(Section):
     """Indirect light from photographed surface, as `shading: {indirect: cache}`; `off` as `path`."""
     denoiser: Choice = "auto"
     """Denoised re-renderings; `off` as `render: {denoise: false}`."""
-
-
-class Override(Section):
-    """What the plan does not decide."""
-
-    components: Components = Components()
-    """Component of plan.yaml -> `on`, `off` or `auto`."""
 
 
 class GivenMaterial(Section):
