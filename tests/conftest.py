@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import lab  # noqa: F401  registers its plug-in, also for the processes that tests start
 from iif_core.errors import InputError
 from tests import hanging
 from tests.browser import browser, page_for  # noqa: F401  fixtures

@@ -4,7 +4,11 @@
 everything that it can depend on.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+
+from workflow import plugins
 
 
 @dataclass(frozen=True)
@@ -18,6 +22,8 @@ class Stage:
         reads_raw: whether files from outside results/ enter here.
         on_demand: whether no scene needs it, only a study or its own target.
         shared: stages whose files it reads in the folder of the scene that all variants of a study share.
+        files: modules whose `raw_inputs` know (and check) further input files.
+        place: name of its module where that is not `workflow.stages.<name>`.
     """
 
     name: str
@@ -26,10 +32,12 @@ class Stage:
     reads_raw: bool = False
     on_demand: bool = False
     shared: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()
+    place: str = ""
 
     @property
     def module(self) -> str:
-        return f"workflow.stages.{self.name}"
+        return self.place or f"workflow.stages.{self.name}"
 
 
 _REPORTED = (
@@ -77,6 +85,7 @@ STAGES: dict[str, Stage] = {
             ("capture", "plan", "segmentation", "base"),
             ("emission", "capture.dynamic_range", "affines.response", "seed"),
             reads_raw=True,
+            files=("workflow.scene.response_file",),
         ),
         Stage("shading", ("capture", "plan", "segmentation", "base", "emission"), ("shading", "seed")),
         Stage(
@@ -125,7 +134,14 @@ STAGES: dict[str, Stage] = {
             on_demand=True,
             shared=("capture", "segmentation"),
         ),
-        Stage("relit_truth", ("capture",), ("source", "relit", "seed"), reads_raw=True, on_demand=True),
+        Stage(
+            "relit_truth",
+            ("capture",),
+            ("source", "relit", "seed"),
+            reads_raw=True,
+            on_demand=True,
+            files=("workflow.sources.relit",),
+        ),
         Stage(
             "relit_scores",
             ("capture", "segmentation", "base", "emission", "second_look", "affines", "relit_truth"),
@@ -139,18 +155,21 @@ STAGES: dict[str, Stage] = {
             ("capture", "segmentation", "base", "emission", "second_look", "affines", "unwrap"),
             ("room", "report.credit", "seed"),
             reads_raw=True,
+            files=("workflow.room.sources",),
         ),
         Stage(
             "report",
             _REPORTED,
             ("report",),
             reads_raw=True,
+            files=("workflow.report.sources",),
         ),
         Stage(
             "publish",
             (*_REPORTED, "report", "room"),
             (),
         ),
+        *(Stage(name, **facts, on_demand=True) for name, facts in plugins.added_stages().items()),
     )
 }
 

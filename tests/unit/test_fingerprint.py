@@ -9,6 +9,7 @@ import textwrap
 
 import pytest
 
+from workflow import plugins
 from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fp
 
@@ -21,7 +22,7 @@ def fingerprints(root, folder, quality="draft"):
         "import json; from workflow.runtime import fingerprint as f; from workflow.registry import STAGES;"
         f"print(json.dumps({{s: f.fingerprint(s, 't', {quality!r}) for s in STAGES}}))"
     )
-    environment = {"PYTHONPATH": str(root), "PATH": "/usr/bin:/bin"}
+    environment = {"PYTHONPATH": str(root), "PATH": "/usr/bin:/bin", plugins.VARIABLE: "lab.plugins"}
     out = subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True)
     assert out.returncode == 0, out.stderr
     return json.loads(out.stdout)
@@ -30,9 +31,9 @@ def fingerprints(root, folder, quality="draft"):
 @pytest.fixture
 def checkout(repository, tmp_path):
     """A copy of the code and a folder with one scene."""
-    for name in ("iif_core", "workflow", "config"):
+    for name in ("iif_core", "workflow", "lab", "config"):
         # Byte code too, so that it need not be compiled; but not what other processes write just now.
-        passing = shutil.ignore_patterns("*.pyc.*", "*.nb?", "*.tmp*")
+        passing = shutil.ignore_patterns("*.pyc.*", "*.nb?", "*.tmp*", "notebook")
         shutil.copytree(repository / name, tmp_path / "code" / name, ignore=passing)
     scenes = tmp_path / "run/config/scenes"
     scenes.mkdir(parents=True)
@@ -132,7 +133,7 @@ def test_closure_covers_what_a_stage_really_imports(repository):
                 status = 1
                 try:
                     for name in names: importlib.import_module(name)
-                    ours = [m for m in set(sys.modules) - before if m.split(".")[0] in ("iif_core", "workflow")]
+                    ours = [m for m in set(sys.modules) - before if m.split(".")[0] in ("iif_core", "workflow", "lab")]
                     os.write(1, (json.dumps(sorted(ours)) + "\\n").encode())
                     status = 0
                 finally:
@@ -140,17 +141,17 @@ def test_closure_covers_what_a_stage_really_imports(repository):
             assert os.waitpid(child, 0)[1] == 0, names
         """
     )
-    plugins = {
+    kinds_of = {
         "capture": ("source", ("builtin", "mitsuba", "folder", "scannetpp", "fipt")),
         "prior": ("prior", ("learned", "simulated", "files", "retinex", "rgbx", "marigold", "pooled")),
         "segmentation": ("segmentation", ("given", "masks", "geometry")),
     }
     cases, roots = [], []
     for stage in STAGES:
-        section, kinds = plugins.get(stage, (None, (None,)))
+        section, kinds = kinds_of.get(stage, (None, (None,)))
         for kind in kinds:
             cases.append((stage, kind, fp.stage_modules(stage, {section: {"kind": kind}} if section else {})))
-            roots.append([STAGES[stage].module] + [p.format(kind) for _, _, p in fp.PLUGINS.get(stage, ())])
+            roots.append([STAGES[stage].module] + ([plugins.implementation(section, kind)] if section else []))
     command = [sys.executable, "-c", probe, json.dumps(roots)]
     out = subprocess.run(command, cwd=repository, capture_output=True, text=True)
     assert out.returncode == 0, out.stderr

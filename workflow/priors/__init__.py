@@ -1,6 +1,7 @@
 """Sources of the K material predictions of a view: one plug-in module per kind, chosen by `prior: {kind: ...}`.
 
-A plug-in is a module `workflow/priors/<kind>.py`. Where each view is predicted by itself, it has the function
+A plug-in is a module `workflow/priors/<kind>.py`, or one that is named in IIF_PLUGINS (workflow/plugins.py). Where each view is
+predicted by itself, it has the function
 
     predict(view, settings, capture, seed) -> (K, H, W, 5) float32
 
@@ -27,6 +28,8 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from workflow import plugins
 
 if TYPE_CHECKING:
     from workflow.scene.normal_form import CaptureReader, View
@@ -58,7 +61,7 @@ def predictor(
     settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep, threads: int = 1
 ) -> Callable[[View], Predicted]:
     """Return what predicts a view by the prior that the settings name."""
-    module = importlib.import_module(f"workflow.priors.{settings.prior.kind}")
+    module = importlib.import_module(plugins.implementation("prior", settings.prior.kind))
     if hasattr(module, "prepare"):
         return module.prepare(settings, capture, seed, keep, threads)
     return lambda view: Predicted(module.predict(view, settings, capture, seed))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from workflow import plugins
 from workflow.priors import Keep, Predicted, members, predictor
 
 if TYPE_CHECKING:
@@ -66,4 +67,4 @@ prepare = Pool
 
 
 def _module(kind: str) -> ModuleType:
-    return import_module(f"workflow.priors.{kind}")
+    return import_module(plugins.implementation("prior", kind))

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from iif_core.errors import InputError
+from workflow import plugins
 from workflow import settings as settings_module
 from workflow.artifacts.files import read_record, sha256_of, write_json
 from workflow.intake.names import shown
@@ -31,30 +32,20 @@ from workflow.settings.names import EXAMPLES
 from workflow.settings.relight import recombines
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-PACKAGES = ("iif_core", "workflow")  # their __init__ hold nothing but a docstring
+PACKAGES = ("iif_core", "workflow", *plugins.packages())  # their __init__ compute nothing
 # Modules that run stages without computing results: the schema number in the manifest stands for their effect on artefacts.
 INFRASTRUCTURE = (
     "workflow.runtime",
     "workflow.registry",
+    "workflow.plugins",
     "workflow.costs",
     "workflow.settings",
     "workflow.batch",
     "workflow.artifacts",
     "iif_core.errors",
 )
-# Stage -> settings that choose a module at run time, with the pattern of its name.
-PLUGINS = {
-    "capture": (("source", "kind", "workflow.sources.{}"),),
-    "prior": (("prior", "kind", "workflow.priors.{}"),),
-    "segmentation": (("segmentation", "kind", "workflow.segmentations.{}"),),
-}
-# Stage -> modules that know (and check) further input files.
-FILE_MODULES = {
-    "emission": ("workflow.scene.response_file",),
-    "report": ("workflow.report.sources",),
-    "room": ("workflow.room.sources",),
-    "relit_truth": ("workflow.sources.relit",),
-}
+# Stage -> the section of the settings whose `kind` chooses a module at run time.
+CHOOSES = {"capture": "source", "prior": "prior", "segmentation": "segmentation"}
 _HERE = f"{REPOSITORY}/"
 _OWN = tuple(f"{_HERE}{name}/" for name in (*PACKAGES, EXAMPLES))
 NEEDED = tuple(stage.name for stage in STAGES.values() if not stage.on_demand)
@@ -153,7 +144,7 @@ def _imported(tree: ast.Module, package: str) -> set[str]:
         elif isinstance(node, ast.ImportFrom):
             base = importlib.util.resolve_name("." * node.level + (node.module or ""), package) if node.level else node.module
             out.update([base or "", *(f"{base}.{alias.name}" for alias in node.names)])
-    return {name for name in out if name.split(".")[0] in PACKAGES}
+    return {name for name in out if (REPOSITORY / name.split(".")[0]).is_dir()}
 
 
 @lru_cache(None)
@@ -161,7 +152,7 @@ def direct_imports(module: str) -> frozenset[str]:
     """Return those of our modules that `module` imports anywhere in its source, also inside functions."""
     found: set[str] = set()
     for name in _facts(module)[1]:
-        if module_file(name):
+        if name.split(".")[0] in PACKAGES and module_file(name):
             parts = name.split(".")
             found.update(".".join(parts[: i + 1]) for i in range(len(parts)))
     return frozenset(name for name in found if module_file(name))
@@ -207,14 +198,24 @@ def stage_modules(stage: str, settings: dict[str, Any]) -> list[str]:
 
 
 def _roots(stage: str, settings: dict[str, Any]) -> tuple[str, ...]:
-    plugins = PLUGINS.get(stage, ())
-    chosen = ((pattern, kind) for section, key, pattern in plugins for kind in _kinds(settings[section], key))
-    return STAGES[stage].module, *(pattern.format(kind) for pattern, kind in chosen)
+    kinds = _kinds(settings[CHOOSES[stage]]) if stage in CHOOSES else []
+    return module_of(stage, settings), *(plugins.implementation(CHOOSES[stage], kind) for kind in kinds)
 
 
-def _kinds(section: dict[str, Any], key: str) -> list[str]:
+def module_of(stage: str, settings: dict[str, Any]) -> str:
+    """Return the name of the module that runs a stage with these settings: its own, or that of a plug-in."""
+    return plugins.replacement(stage, settings) or STAGES[stage].module
+
+
+def settings_of(stage: str, settings: dict[str, Any]) -> tuple[str, ...]:
+    """Return the dotted settings that a stage reads, with these settings."""
+    more = plugins.reads(stage) if plugins.replacement(stage, settings) else ()
+    return (*STAGES[stage].settings, *(key for key in more if key not in STAGES[stage].settings))
+
+
+def _kinds(section: dict[str, Any]) -> list[str]:
     """Return what a section chooses, and what its members choose where it has any (`prior: {kind: pooled}`)."""
-    return [section[key], *(member[key] for member in section.get("of", ()))]
+    return [section["kind"], *(member["kind"] for member in section.get("of", ()))]
 
 
 def code_digest(stage: str, settings: dict[str, Any]) -> str:
@@ -259,15 +260,15 @@ def _raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
     if stage in ("relight", "lamp_images"):
         entries = document["relight"] if stage == "relight" else [entry for entry in document["relight"] if recombines(entry)]
         out.extend(settings_module.relight_files(entries))
-    for section, key, pattern in PLUGINS.get(stage, ()):
-        name = pattern.format(document[section][key])
+    if stage in CHOOSES:
+        name = plugins.implementation(CHOOSES[stage], document[CHOOSES[stage]]["kind"])
         path = module_file(name)
-        if path is not None and "raw_inputs" not in path.read_text():
-            continue  # importing it may take as long as all of the plan: some load compilers
-        module = importlib.import_module(name)
-        if hasattr(module, "raw_inputs"):
-            out.extend(module.raw_inputs(document))
-    for name in FILE_MODULES.get(stage, ()):
+        # Importing a module may take as long as all of the plan: some load compilers.
+        if path is None or "raw_inputs" in path.read_text():
+            module = importlib.import_module(name)
+            if hasattr(module, "raw_inputs"):
+                out.extend(module.raw_inputs(document))
+    for name in STAGES[stage].files:
         out.extend(importlib.import_module(name).raw_inputs(document))
     return out
 
@@ -300,7 +301,7 @@ def fingerprint(stage: str, scene: str, quality: str) -> str:
         raise InputError(f"{origin(scene)}: {error}") from None
     facts = {
         "stage": stage,
-        "settings": settings_module.select(document, STAGES[stage].settings),
+        "settings": settings_module.recorded(document, settings_of(stage, document)),
         "code": code_digest(stage, document),
         "raw": raw,
         "upstream": {up: fingerprint(up, scene, quality) for up in STAGES[stage].upstream},

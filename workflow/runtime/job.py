@@ -46,8 +46,8 @@ class Job:
 
     Attributes:
         name: of the job: the name of its stage, or such as `prior.3-of-8` if the job makes only a part.
-        settings: the parts of the settings tree that the registry lists for this stage, by attribute (`job.settings.base.ridge`);
-            any other raises AttributeError.
+        settings: the parts of the settings tree that the registry, or a plug-in that runs the stage, lists for it, by attribute
+            (`job.settings.base.ridge`); any other raises AttributeError.
         seed: seed of the scene, if the registry lists it.
         threads: number of cores that this job may use.
         device: on which rays are traced, as the scene asks and this machine has it.
@@ -70,7 +70,7 @@ class Job:
     @cached_property
     def settings(self) -> SimpleNamespace:
         tree: dict[str, Any] = {}
-        for dotted, value in settings_module.select(self.document, self.stage.settings).items():
+        for dotted, value in settings_module.select(self.document, fp.settings_of(self.stage.name, self.document)).items():
             node = tree
             *parents, leaf = dotted.split(".")
             for part in parents:
@@ -145,7 +145,7 @@ class Job:
             "stage": self.stage.name,
             "quality": self.quality,
             "fingerprint": self.fingerprint,
-            "settings": settings_module.select(self.document, self.stage.settings),
+            "settings": settings_module.recorded(self.document, fp.settings_of(self.stage.name, self.document)),
             "code": fp.code_digest(self.stage.name, self.document),
             "seed": self.document["seed"],
             "inputs": inputs,
@@ -297,11 +297,10 @@ def run_stage(
     if job.device.kind != "cpu":
         job.log.info("rays are traced on %s", job.device)
     if part:
-        importlib.import_module(f"{job.stage.module}_part").run(job, *part)
+        importlib.import_module(f"{fp.module_of(stage, job.document)}_part").run(job, *part)
         job.write_timings(job.name)
         return
-    module = importlib.import_module(job.stage.module)
-    module.run(job)
+    importlib.import_module(fp.module_of(stage, job.document)).run(job)
     job.writer.finish()
     stamps.stamp_stage(Path("results"), scene, stage, job.writer.seen)
     if job.stage.reads_raw:

@@ -16,6 +16,7 @@ import numpy as np
 from iif_core.camera.distortion import Distortion, Pinhole, distort
 from iif_core.errors import InputError
 from iif_core.objects.mask_clustering import flatten_masks
+from workflow import plugins
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.settings.names import data_folder, did_you_mean_path
 from workflow.sources.folder_scene import images
@@ -110,7 +111,7 @@ def mask_files(own: dict[str, Any], source: dict[str, Any], capture: dict[str, A
     maps, binary = _listing(folder)
     photographs: dict[str, Photograph] = {}
     if source["kind"] in PHOTOGRAPHED:
-        find_inputs = importlib.import_module(f"workflow.sources.{source['kind']}").find_inputs
+        find_inputs = importlib.import_module(plugins.implementation("source", source["kind"])).find_inputs
         known = find_inputs(source, {**capture, "views": 1_000_000_000}).transforms.frames
         photographs = {frame.name: Photograph(frame.camera, frame.lens, frame.turn) for frame in known}
         _refuse_unknown(folder, {*maps, *binary}, set(photographs))

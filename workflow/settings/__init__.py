@@ -13,7 +13,7 @@ from workflow.settings.loading import load, relight_origin, scene_file, scene_or
 from workflow.settings.names import QUALITIES, RESERVED, SCENE_NAME, scene_names
 from workflow.settings.relight import relight_files, require_relighting
 from workflow.settings.relight_plans import active_plan, plan_names
-from workflow.settings.scene import UNIONS, SceneSettings, dump, select
+from workflow.settings.scene import UNIONS, SceneSettings, dump, recorded, select
 from workflow.settings.section import Section
 from workflow.settings.targets import refuse_profile, refuse_scatter, refuse_target
 from workflow.settings.yaml_file import read_yaml
@@ -30,6 +30,7 @@ __all__ = [
     "load",
     "plan_names",
     "read_yaml",
+    "recorded",
     "plan_schema_json",
     "reference_markdown",
     "refuse_profile",

@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import Field, model_validator
 
+from workflow import plugins
 from workflow.settings.section import Section
 
 
@@ -107,9 +108,8 @@ class MarigoldPrior(DiffusionPrior):
     """Longest side in pixels to which photographs are scaled for the model; by default as the checkpoint recommends (768)."""
 
 
-Member = Annotated[
-    LearnedPrior | RetinexPrior | FilesPrior | RgbxPrior | MarigoldPrior | SimulatedPrior, Field(discriminator="kind")
-]
+_MEMBERS = plugins.union("prior", LearnedPrior, RetinexPrior, FilesPrior, RgbxPrior, MarigoldPrior, SimulatedPrior)
+Member = Annotated[_MEMBERS, Field(discriminator="kind")]
 
 
 class PooledPrior(PriorBase):
@@ -132,10 +132,7 @@ class PooledPrior(PriorBase):
         return {**value, "of": [{**common, **one} if isinstance(one, dict) else one for one in members]}
 
 
-Prior = Annotated[
-    LearnedPrior | RetinexPrior | FilesPrior | RgbxPrior | MarigoldPrior | SimulatedPrior | PooledPrior,
-    Field(discriminator="kind"),
-]
+Prior = Annotated[_MEMBERS | PooledPrior, Field(discriminator="kind")]
 
 
 def members(prior: dict[str, Any]) -> list[dict[str, Any]]:

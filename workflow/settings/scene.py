@@ -2,21 +2,43 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from workflow.settings.affines import FREE_CELLS, Affines, textures_cells
-from workflow.settings.base import Base, SecondLook
-from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES, PUBLISHED, Emission, Shading
+from workflow import plugins
+from workflow.settings import affines, base, light, outputs
+from workflow.settings.affines import FREE_CELLS, textures_cells
+from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES, PUBLISHED
 from workflow.settings.limits import Limits
-from workflow.settings.outputs import Export, Metrics, Relit, Render, Report, Room
+from workflow.settings.outputs import Relit
 from workflow.settings.override import ByObject, Override
 from workflow.settings.prior import LearnedPrior, Member, Prior, predictions
 from workflow.settings.relight import Relightings, lamp_bases, recombines
 from workflow.settings.section import Section
 from workflow.settings.segmentation import GeometrySegmentation, Segmentation
 from workflow.settings.source import Capture, Source
+
+_SECTIONS: dict[str, type[Section]] = {
+    "base": base.Base,
+    "emission": light.Emission,
+    "shading": light.Shading,
+    "second_look": base.SecondLook,
+    "affines": affines.Affines,
+    "render": outputs.Render,
+    "metrics": outputs.Metrics,
+    "export": outputs.Export,
+    "report": outputs.Report,
+    "room": outputs.Room,
+}
+"""Sections to which plug-ins may add fields."""
+EXTENDED = {name: plugins.extended(name, own) for name, own in _SECTIONS.items()}
+"""The same with those fields."""
+Base, Emission, Shading, SecondLook, Affines = (
+    EXTENDED[name] for name in ("base", "emission", "shading", "second_look", "affines")
+)
+Render, Metrics, Export, Report, Room = (EXTENDED[name] for name in ("render", "metrics", "export", "report", "room"))
 
 
 class SceneSettings(Section):
@@ -146,6 +168,9 @@ class SceneSettings(Section):
         return self
 
 
+SceneSettings = plugins.extended("scene", SceneSettings)
+
+
 def _members(union: Any) -> dict[str, type[Section]]:
     """Return the sections of a union by their `kind`."""
     sections = get_args(get_args(union)[0])
@@ -187,4 +212,26 @@ def select(document: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
         for part in key.split("."):
             value = value[part]
         out[key] = value
+    return out
+
+
+@cache
+def _added(section: str) -> dict[str, Any]:
+    """Return the fields that plug-ins add to a section, with their defaults as they are dumped."""
+    own = _SECTIONS.get(section, Section).model_fields
+    dumped = EXTENDED[section]().model_dump(mode="json") if section in EXTENDED else {}
+    return {name: value for name, value in dumped.items() if name not in own}
+
+
+def recorded(document: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
+    """Return what `select` returns without the fields of plug-ins that are at their defaults, so that fingerprints and manifests
+    do not depend on plug-ins that take no part."""
+    out: dict[str, Any] = {}
+    for key, value in select(document, keys).items():
+        section, _, field = key.partition(".")
+        added = _added(section)
+        if not field and added:
+            out[key] = {name: entry for name, entry in value.items() if name not in added or entry != added[name]}
+        elif field not in added or value != added[field]:
+            out[key] = value
     return out

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from workflow import plugins
 from workflow.settings.section import Section
 
 
@@ -91,4 +92,7 @@ class GeometrySegmentation(PiecesOfMesh):
     kind: Literal["geometry"] = "geometry"
 
 
-Segmentation = Annotated[GivenSegmentation | MaskSegmentation | GeometrySegmentation, Field(discriminator="kind")]
+Segmentation = Annotated[
+    plugins.union("segmentation", GivenSegmentation, MaskSegmentation, GeometrySegmentation),
+    Field(discriminator="kind"),
+]

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
+from workflow import plugins
 from workflow.settings.section import ON_OFF, Section
 
 
@@ -110,7 +111,10 @@ class FiptSource(PhotographedSource):
     """Object ids: `parts` = `IndexMA`, `semantic` = `segmentation`; `auto`: the first of the two that exists."""
 
 
-Source = Annotated[BuiltinSource | MitsubaSource | FolderSource | ScanNetppSource | FiptSource, Field(discriminator="kind")]
+Source = Annotated[
+    plugins.union("source", BuiltinSource, MitsubaSource, FolderSource, ScanNetppSource, FiptSource),
+    Field(discriminator="kind"),
+]
 
 
 class Capture(Section):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import importlib
 
+from workflow import plugins
 from workflow.runtime.job import Job
 
 
 def run(job: Job) -> None:
-    """Call the source that the scene names, `workflow/sources/<kind>.py`."""
-    source = importlib.import_module(f"workflow.sources.{job.settings.source.kind}")
+    """Call the source that the scene names."""
+    source = importlib.import_module(plugins.implementation("source", job.settings.source.kind))
     source.capture(job)

@@ -12,6 +12,7 @@ from iif_core.fusion.problem import prediction_faults
 from iif_core.numerics.filters import fill_from_neighbours
 from iif_core.numerics.parallel import map_in_order
 from iif_core.reflectance.material import PROPERTIES
+from workflow import plugins
 from workflow.artifacts.scratch import Scratch
 from workflow.artifacts.store import StageWriter, rgb, split_rgb
 from workflow.priors import Predicted, members, predictor
@@ -36,7 +37,7 @@ def run(job: Job) -> None:
     rows = predicted(job, capture, capture.used)
     _write_table(job, rows)
     job.writer.table("faces.parquet", albedo_of_faces(job.writer, capture, {view_id for view_id, _, used, _ in rows if used}))
-    prior = importlib.import_module(f"workflow.priors.{job.settings.prior.kind}")
+    prior = importlib.import_module(plugins.implementation("prior", job.settings.prior.kind))
     if hasattr(prior, "describe"):
         job.writer.json("model.json", prior.describe(job.settings))
 

@@ -12,6 +12,7 @@ import numpy as np
 from iif_core.errors import InputError
 from iif_core.surface.segments import interior, partition_agreement, segment_table
 from iif_core.surface.triangles import face_geometry
+from workflow import plugins
 from workflow.artifacts.store import ids_to_disk
 from workflow.decisions import objects as decisions
 from workflow.runtime.job import Job
@@ -27,7 +28,7 @@ def run(job: Job) -> None:
     """
     capture = CaptureReader(job.read("capture"))
     surface = Surface(capture, job.read("prior"))
-    kind = importlib.import_module(f"workflow.segmentations.{job.settings.segmentation.kind}")
+    kind = importlib.import_module(plugins.implementation("segmentation", job.settings.segmentation.kind))
     if hasattr(kind, "prepare"):
         with job.timed("masks"):
             kind.prepare(job, surface)

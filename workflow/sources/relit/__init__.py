@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from iif_core.errors import InputError
+from workflow import plugins
 
 if TYPE_CHECKING:
     from workflow.runtime.job import Job
@@ -44,7 +45,7 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
     """
     kind = document["source"]["kind"]
     _module(kind)
-    return importlib.import_module(f"workflow.sources.{kind}").raw_inputs(document)
+    return importlib.import_module(plugins.implementation("source", kind)).raw_inputs(document)
 
 
 def open_room(job: Job, capture: CaptureReader) -> Room:

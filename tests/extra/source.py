@@ -1,0 +1,3 @@
+"""A source that nobody has."""
+
+COUNT = 3
