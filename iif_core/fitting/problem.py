@@ -145,27 +145,6 @@ class FitOptions:
 
 
 @dataclass(frozen=True)
-class SgdOptions:
-    """Schedule of the paper's optimiser; the defaults are published, but for `adam`.
-
-    Attributes:
-        method: `sgd` or `adam`; rate: step size, None: 10, or 0.01 for adam.
-        epochs: passes over the pixels; batch: pixels of a step; decay: factor on the rate after each epoch.
-        seed: of the order of the pixels; free_response: fit the response too.
-        steps: steps over all epochs, with as many passes over the pixels as they need; None: one pass an epoch.
-    """
-
-    method: str = "sgd"
-    rate: float | None = None
-    epochs: int = 3
-    batch: int = 32768
-    decay: float = 0.2
-    seed: int = 0
-    free_response: bool = True
-    steps: int | None = None
-
-
-@dataclass(frozen=True)
 class FitResult:
     """Result of a solver.
 

@@ -145,7 +145,7 @@ def _rows(name: str, study: study_files.Study, cell: Cell, quality: str) -> list
         "scene": cell.scene,
         "variant": cell.variant,
         "label": variant.label or cell.variant,
-        "settings": json.dumps(variant.layer, sort_keys=True),
+        "settings": json.dumps({**variant.overrides, **({"preset": variant.preset} if variant.preset else {})}, sort_keys=True),
         "seed": cell.seed,
         **(_costs(cell, quality, study.costs) if not variant.row else {}),
         "status": "ok",

@@ -164,8 +164,8 @@ def test_a_choice_drops_what_lower_layers_set_for_the_other_one(scene):
 
 def test_defaults_are_those_of_the_solvers(repository):
     from iif_core.fitting.problem import FitOptions
-    from iif_core.fitting.sgd import SgdOptions
-    from iif_core.light.emission import sgd
+    from lab.published.fitting.sgd import SgdOptions
+    from lab.published.light import sgd
 
     tree = settings.SceneSettings(source={"kind": "builtin"}, prior={"kind": "simulated"})
     for section, options in (
