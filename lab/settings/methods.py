@@ -58,7 +58,7 @@ class Emission(light.Emission):
 
     solver: Literal["direct", "published", "published_repaired"] = "direct"
     """`direct`: non-negative least squares; `published`: the paper's method; `published_repaired`: without its errors
-    (docs/method/published.md#emission)."""
+    (docs/development/published.md#emission)."""
     iterations: int | None = Field(None, ge=1)
     """`published`: steps of 8192 pixels each; default: one pass over all pixels."""
 
@@ -69,7 +69,7 @@ class Shading(light.Shading):
     method: Literal["shared_paths", "published"] = "shared_paths"
     """`shared_paths`: all lobes from one set of paths, diffuse light once for every surface cell; `published`: as the paper has
     it, at every pixel 256 paths for diffuse light and 64 to 128 for each of 6 levels, of one bounce, and the denoiser
-    (docs/method/published.md#shading)."""
+    (docs/development/published.md#shading)."""
 
 
 class Affines(affines.Affines):
@@ -81,7 +81,7 @@ class Affines(affines.Affines):
     `fipt`, `iris`: a free BRDF in every cell."""
     solver: Literal["direct", "sgd", "adam", "published"] = "direct"
     """With `objects`: `direct`: Gauss-Newton; `sgd`: stochastic gradient descent on the paper's loss; `adam`: Adam on the same
-    loss; `published`: the paper's descent to the letter (docs/method/published.md#materials). With `fipt`, `iris`: `direct`:
+    loss; `published`: the paper's descent to the letter (docs/development/published.md#materials). With `fipt`, `iris`: `direct`:
     exact for every cell; `adam`: gradient descent on the same loss."""
     epochs: int = Field(3, ge=1)
     """`sgd`, `adam`, `published`: passes over the pixels; the step size falls to a fifth after each."""

@@ -1,4 +1,4 @@
-"""The published method: light of one bounce, its descent to emitters, its descent to materials (docs/method/published.md)."""
+"""The published method: light of one bounce, its descent to emitters, its descent to materials (docs/development/published.md)."""
 
 import numpy as np
 import pytest

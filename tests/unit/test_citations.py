@@ -19,7 +19,7 @@ PAGE_OF_LETTER = {
     "R": "reflectance",
     "C": "camera",
     "P": "priors",
-    "T": "published",
+    "T": "../development/published",
     "N": "plan",
     "O": "objects",
     "F": "fusion",
