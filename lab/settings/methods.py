@@ -98,6 +98,8 @@ class Affines(affines.Affines):
             raise ValueError(f"`solver: {self.solver}` does not fit `model: {self.model}`; allowed with it: {', '.join(solvers)}")
         return self
 
-    def fits_cells(self, prior_kind: str) -> bool:
-        """Return whether surface cells get materials of their own."""
-        return self.model in FREE_CELLS or (self.model == "objects" and super().fits_cells(prior_kind))
+    def of_cells(self, prior_kind: str) -> str:
+        """Return what gives surface cells materials of their own, in words; empty if nothing does."""
+        if self.model in FREE_CELLS:
+            return f"`affines: model: {self.model}`"
+        return super().of_cells(prior_kind) if self.model == "objects" else ""

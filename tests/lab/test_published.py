@@ -1,4 +1,5 @@
-"""The published method: light of one bounce, its descent to emitters, its descent to materials (docs/development/published.md)."""
+"""The published method: light of one bounce, its descent to emitters, its descent to materials
+(docs/development/published.md)."""
 
 import numpy as np
 import pytest

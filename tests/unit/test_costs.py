@@ -147,12 +147,10 @@ def test_jobs_of_two_threads_tell_what_they_divide(wall, divided):
     assert model.fit_rows([row for row in rows if row["threads"] == 1])["render", "all", "cpu_seconds"].divided == 0.0
 
 
-@pytest.mark.parametrize("preset", ["ours", "published", "published_repaired"])
 @pytest.mark.parametrize("quality", ["draft", "standard", "paper"])
-def test_every_stage_has_work(repository, tmp_path, preset, quality):
+def test_every_stage_has_work(repository, tmp_path, quality):
     (tmp_path / "config/scenes").mkdir(parents=True)
-    source = "source: {kind: builtin, scene: kitchen}\nprior: {kind: simulated}\n"
-    (tmp_path / "config/scenes/x.yaml").write_text(f"{source}preset: {preset}\n")
+    (tmp_path / "config/scenes/x.yaml").write_text("source: {kind: builtin, scene: kitchen}\nprior: {kind: simulated}\n")
     document = settings.dump(settings.load("x", quality, tmp_path))
     for stage in STAGES:
         work = work_of(stage, document, ROOM)

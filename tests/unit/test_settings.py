@@ -33,9 +33,7 @@ def scene(tmp_path):
     ("text", "pixels", "noise"),
     [
         ("affines: {pixels: 5000}", 5000, 0.2),
-        ("affines: {model: object_mean}", 200_000, 0.2),
         ("affines: {texture: photographs}", "all", 0.1),
-        ("affines: {model: fipt}", "all", 0.1),
         ("shading: {pixels: all}", "all", 0.2),
         ("shading: {pixels: 300000}", 300_000, 0.2),
     ],
@@ -58,7 +56,6 @@ def test_noise_of_the_light_can_be_set(scene):
     ("text", "words"),
     [
         ("shading: {pixels: 1000}\naffines: {pixels: 5000}", ["`shading: pixels` is 1000", "reads 5000", "at least `5000`"]),
-        ("shading: {pixels: 1000}\naffines: {model: iris}", ["`shading: pixels` is 1000", "model: iris", "`all`"]),
         ("shading: {pixels: 1000}\naffines: {texture: photographs}", ["texture from the photographs reads every pixel"]),
         ("shading: {pixels: some}", ["shading.pixels", "'auto', 'all' or a whole number of at least 100", "some"]),
         ("shading: {pixels: 5}", ["shading.pixels", "'auto', 'all' or a whole number of at least 100", "found 5"]),
@@ -101,24 +98,13 @@ def test_scene_over_preset_over_default(scene):
         (GOOD + "affines: {scale: {mean_albedo: 3}}\n", ["`affines.scale.mean_albedo`: found 3", "at most 1"]),
         ("source: {kind: mitsuba, path: 3}\nprior: {kind: simulated}\n", ["source.path", "found 3"]),
         ("source: {kind: builtn}\nprior: {kind: simulated}\n", ["source.kind", "found 'builtn'", "Did you mean builtin?"]),
-        (f"{GOOD}affines: {{solver: dirct}}\n", ["affines.solver", "found 'dirct'", "Did you mean direct?"]),
+        (f"{GOOD}affines: {{response: srg}}\n", ["affines.response", "found 'srg'", "Did you mean srgb?"]),
         (f"{GOOD}affines: {{pixels: some}}\n", ["affines.pixels", "found 'some'", "'all' or a whole number of at least 100"]),
         ("prior: {kind: simulated}\n", ["`source`: missing"]),
         ("source: {kind: builtin\n", ["x.yaml", "line", "not valid YAML"]),
         ("- a\n- b\n", ["found list", "key: value"]),
         (GOOD + "capture: {views: 3, views: 5}\n", ["x.yaml, line 3", "`views` stands twice"]),
         ("source: builtin\nprior: {kind: simulated}\n", ["`source`", "'builtin'", "{kind: ...}"]),
-        (GOOD + "base: {iterations: 100}\n", ["base", "`iterations`", "`solver: sgd` alone", "remove it"]),
-        (GOOD + "base: {solver: sgd, sweeps: 3}\n", ["base", "`sweeps`", "`solver: direct` alone"]),
-        (GOOD + "emission: {iterations: 5}\n", ["`emission`: `iterations`: read by `solver: sgd` alone", "`solver: direct`"]),
-        (GOOD + "emission: {preset: paper}\n", ["`emission`: `preset`: read by `solver: sgd` alone"]),
-        (GOOD + "affines: {epochs: 5, rate: 1}\n", ["`affines`: `epochs`, `rate`: read by `solver: sgd` alone"]),
-        (
-            GOOD + "affines: {solver: adam, robust_width: 1}\n",
-            ["`robust_width`: read by `solver: direct` alone", "`solver: adam`"],
-        ),
-        (GOOD + "affines: {model: fipt, scale: prior}\n", ["`scale`: read by `model: objects` alone", "set the model"]),
-        (GOOD + "affines: {model: iris, solver: adam, epochs: 9}\n", ["`epochs`: read by `model: objects` alone"]),
         (GOOD + "metrics: {views: 0}\n", ["metrics.views", "found 0", "a whole number of at least 1"]),
         (GOOD + "affines: {ridge: 0.1}\n", ["`affines.ridge`: unknown key. It was removed", "no effect"]),
         (GOOD + "base: {predictions: 99}\n", ["`base: predictions` is 99", "`prior` makes 8"]),
@@ -150,32 +136,16 @@ def test_scene_file_that_is_not_utf8(scene):
         settings.load("x", "draft", root)
 
 
-def test_a_value_that_equals_the_default_is_never_idle(scene):
-    root = scene(GOOD + "affines: {model: fipt, iterations: 60}\nbase: {solver: sgd, sweeps: 9}\n")
-    assert settings.load("x", "draft", root).affines.iterations == 60
-
-
-def test_a_choice_drops_what_lower_layers_set_for_the_other_one(scene):
-    """A preset that sets a number for the direct solver must not forbid a scene to use another solver."""
-    root = scene(GOOD + "affines: {solver: sgd}\n", "affines: {iterations: 7, pixels: 500}\n")
-    got = settings.load("x", "draft", root).affines
-    assert (got.solver, got.iterations, got.pixels) == ("sgd", 60, 500)
-
-
 def test_defaults_are_those_of_the_solvers(repository):
     from iif_core.fitting.problem import FitOptions
-    from lab.published.fitting.sgd import SgdOptions
-    from lab.published.light import sgd
 
     tree = settings.SceneSettings(source={"kind": "builtin"}, prior={"kind": "simulated"})
     for section, options in (
         (tree.affines, FitOptions()),
-        (tree.affines, SgdOptions()),
         (tree.base, FusionOptions()),
     ):
         shared = set(type(section).model_fields) & {field.name for field in fields(options)}
         assert {name: getattr(section, name) for name in shared} == {name: getattr(options, name) for name in shared}
-    assert tree.emission.preset == sgd.SgdOptions().preset
 
 
 def test_a_folder_without_configuration_uses_that_of_the_repository(tmp_path, repository):
@@ -246,38 +216,6 @@ def test_registry_is_ordered_and_its_settings_exist(repository):
         settings.select(document, stage.settings)
 
 
-def test_a_preset_lies_below_the_file_that_names_it(scene):
-    root = scene(GOOD + "preset: published\nemission: {iterations: 7}\n", "affines: {pixels: 500}\nemission: {samples: 4}\n")
-    got = settings.load("x", "draft", root)
-    solvers = got.base.solver, got.emission.solver, got.affines.solver
-    assert (got.preset, *solvers) == ("published", "sgd", "published", "published")
-    assert (got.emission.samples, got.emission.iterations, got.affines.pixels, got.shading.pixels) == (128, 7, "all", "all")
-    repaired = settings.load("x", "draft", scene(GOOD + "preset: published_repaired\n"))
-    assert (repaired.base.preset, repaired.base.texture, repaired.emission.solver) == ("safe", "hashgrid", "published_repaired")
-
-
-def test_a_setting_of_ours_beside_a_preset_is_idle(scene):
-    with pytest.raises(InputError, match=r"`prune`: read by `solver: direct` or `sgd` alone"):
-        settings.load("x", "draft", scene(GOOD + "preset: published\nemission: {prune: 0.2}\n"))
-    with pytest.raises(InputError, match=r"`levels`: read by `method: shared_paths` alone"):
-        settings.load("x", "draft", scene(GOOD + "preset: published\nshading: {levels: 4}\n"))
-    with pytest.raises(InputError, match="no measured curve"):
-        settings.load("x", "draft", scene(GOOD + "preset: published\naffines: {response: {file: c.csv}}\n"))
-    with pytest.raises(InputError, match="8-bit photographs"):
-        settings.load("x", "draft", scene(GOOD + "preset: published\ncapture: {dynamic_range: hdr}\n"))
-    with pytest.raises(InputError, match="preset"):
-        settings.load("x", "draft", scene(GOOD + "preset: theirs\n"))
-
-
-def test_mistakes_beside_a_preset_are_those_of_the_file_that_names_it(scene):
-    for text, words in (("capture: {dynamic_range: hdr}\n", "8-bit photographs"), ("emission: {prune: 0.2}\n", "`prune`")):
-        with pytest.raises(InputError, match=rf"^config/scenes/x.yaml: .*{words}"):
-            settings.load("x", "draft", scene(GOOD + "preset: published\n" + text))
-    root = scene(GOOD + "affines: {model: no_such}\n", "preset: published\n")  # the quality names it
-    with pytest.raises(InputError, match=r"^config/scenes/x.yaml: `affines.model`"):
-        settings.load("x", "draft", root)
-
-
 def test_yaml_is_read_alike_with_and_without_libyaml(tmp_path, monkeypatch):
     """A merged mapping is no duplicate, a key that stands twice is one, and what is wrong is named."""
     path, found = tmp_path / "x.yaml", []
@@ -319,7 +257,6 @@ def test_a_forced_component_is_the_setting_of_its_own(scene, words, section, key
         ("override: {components: {metallic: on}}", "override.components.metallic"),
         ("override: {components: {gloss: off}}", "gloss"),
         ("override: {components: {specular: maybe}}", "'auto', 'on' or 'off'"),
-        ("capture: {dynamic_range: ldr}\npreset: published\noverride: {components: {specular: off}}", "has no plan"),
     ],
 )
 def test_an_override_that_cannot_be(scene, text, words):

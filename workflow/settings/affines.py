@@ -104,6 +104,9 @@ class Affines(Section):
     detail that the photographs show in each cell, without slow changes across an object; `auto`: `photographs` for
     `prior: {kind: retinex}`, which was made before the light was known, `base` otherwise."""
 
-    def fits_cells(self, prior_kind: str) -> bool:
-        """Return whether surface cells get materials of their own, which reads every pixel; with the prior of a kind."""
-        return textures_cells(self.texture, prior_kind)
+    def of_cells(self, prior_kind: str) -> str:
+        """Return what gives surface cells materials of their own, for which every pixel is read, in words; empty if nothing does.
+
+        prior_kind: `kind` of the prior.
+        """
+        return "texture from the photographs" if textures_cells(self.texture, prior_kind) else ""

@@ -125,14 +125,17 @@ class SceneSettings(Section):
     def _automatic_shading(self) -> SceneSettings:
         """Replace `shading: {pixels: auto}` by the number or `all`, and `noise: auto` by the number: what is traced follows from
         what is read."""
-        cells = self.affines.fits_cells(self.prior.kind)
-        every = cells or self.affines.pixels == "all"
+        cells = self.affines.of_cells(self.prior.kind)
+        every = bool(cells) or self.affines.pixels == "all"
         asked, needed = self.shading.pixels, "all" if every else self.affines.pixels
         if asked == "auto":
             object.__setattr__(self, "shading", self.shading.model_copy(update={"pixels": needed}))
         elif asked != "all" and (every or asked < self.affines.pixels):
-            reader = "texture from the photographs" if cells else "`affines: pixels: all`"
-            why = f"{reader} reads every pixel" if every else f"the fit reads {needed} (`affines: pixels`)"
+            why = (
+                f"{cells or '`affines: pixels: all`'} reads every pixel"
+                if every
+                else f"the fit reads {needed} (`affines: pixels`)"
+            )
             raise ValueError(f"`shading: pixels` is {asked}, but {why}; write `auto`, or at least `{needed}`")
         if self.shading.noise == "auto":
             noise = NOISE_OF_TEXTURES if cells else NOISE_OF_OBJECTS
