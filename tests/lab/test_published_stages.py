@@ -1,4 +1,4 @@
-"""Stages emission, shading and affines of `preset: published` on the tiny room: artefacts, resumption, refusal."""
+"""Stages emission, shading and affines as published on the tiny room: artefacts, resumption, refusal."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ import pytest
 from iif_core.errors import InputError
 from workflow.artifacts import StageReader
 from workflow.runtime import fingerprint
-from workflow.runtime.job import Job, run_stage
+from workflow.runtime.job import run_stage
 from workflow.scene.normal_form import CaptureReader
 
 SCENE = """\
-preset: published
 source: {kind: builtin, scene: tiny}
 capture: {views: 4, width: 32, height: 32, samples: 16}
 prior: {kind: simulated, samples: 2}
 segmentation: {kind: given}
 base: {solver: direct}
-emission: {iterations: 110, samples: 4}
-affines: {batch: 1024}
+emission: {solver: published, iterations: 110, samples: 4}
+shading: {method: published, pixels: all}
+second_look: {enabled: false}
+affines: {solver: published, pixels: all, batch: 1024}
 """
 FIRST = ("capture", "plan", "prior", "segmentation", "base")
 
@@ -152,19 +153,19 @@ def test_a_killed_base_goes_on_after_its_last_epoch(finished, tmp_path, monkeypa
             raise KeyboardInterrupt
         return whole(self, step)
 
-    written = Job.keep_state
+    written = base.keep_state
 
-    def noted(job, name, arrays, facts):
+    def noted(writer, name, arrays, facts):
         kept.append(facts["step"])
-        written(job, name, arrays, facts)
+        written(writer, name, arrays, facts)
 
     kept = []
-    monkeypatch.setattr(Job, "keep_state", noted)
+    monkeypatch.setattr(base, "keep_state", noted)
     monkeypatch.setattr(engine.Engine, "step", killed)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, ("base",), monkeypatch, descent)
     assert kept and kept == [kept[0] * (i + 1) for i in range(len(kept))] and 7 - kept[0] < kept[-1] <= 7
-    monkeypatch.setattr(Job, "keep_state", written)
+    monkeypatch.setattr(base, "keep_state", written)
     resumed = digests(run(tmp_path, ("base",), monkeypatch, descent)["base"])
     assert len(steps) == 8 + 12 - kept[-1]
     monkeypatch.setattr(engine.Engine, "step", whole)

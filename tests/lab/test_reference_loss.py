@@ -120,7 +120,7 @@ def test_predictions_may_be_a_callable():
 
 
 def test_pieces_of_a_view_sum_to_the_whole(monkeypatch):
-    from iif_core.fusion import reference_loss as module
+    from lab.published.fusion import reference_loss as module
 
     state = random_state()
     a = reference_loss(*state)

@@ -10,6 +10,7 @@ from iif_core.camera.response import Response
 from iif_core.fitting.problem import FitProblem, FitResult
 from lab.published.fitting.descent import PublishedOptions, PublishedState, fit_published
 from lab.published.fitting.sgd import SgdOptions, fit_affines_sgd
+from lab.published.state import keep_state, kept_state
 from workflow.fitting.fit_pixels import FitPixels
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import BaseScene
@@ -39,11 +40,11 @@ def _published(job: Job, problem: FitProblem, start: Response) -> FitResult:
     settings = job.settings.affines
     rate = PublishedOptions.rate if settings.rate is None else settings.rate
     options = PublishedOptions(rate, epochs=settings.epochs, batch=settings.batch, seed=job.seed)
-    kept = job.kept_state("descent")
+    kept = kept_state(job.writer, "descent")
     at = kept and PublishedState(**kept[0], step=kept[1]["step"], loss=tuple(kept[1]["loss"]))
 
     def keep(state: PublishedState) -> None:
         facts = {"step": state.step, "loss": list(state.loss)}
-        job.keep_state("descent", {"affine": state.affine, "params": state.params}, facts)
+        keep_state(job.writer, "descent", {"affine": state.affine, "params": state.params}, facts)
 
     return fit_published(problem, start, options, at, keep)

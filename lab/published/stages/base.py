@@ -20,6 +20,7 @@ from lab.published.fusion.matching import REGULARISER
 from lab.published.fusion.reference_loss import loss_of_result
 from lab.published.fusion.sgd.options import preset_grid, sgd_options
 from lab.published.fusion.sgd.solve import SgdFit, SgdState, converged, solve_sgd
+from lab.published.state import keep_state, kept_state
 from workflow.artifacts.scratch import Scratch
 from workflow.artifacts.store import split_rgb
 from workflow.runtime.job import Job
@@ -100,7 +101,7 @@ def _descended(job: Job, problem: FusionProblem) -> SgdFit:
     last = time.monotonic()
 
     def load() -> SgdState | None:
-        kept = job.kept_state("descent")
+        kept = kept_state(job.writer, "descent")
         if kept is None:
             return None
         job.log.info("the descent continues from step %d", kept[1]["step"])
@@ -110,7 +111,7 @@ def _descended(job: Job, problem: FusionProblem) -> SgdFit:
         nonlocal last
         if time.monotonic() - last >= KEPT_EVERY:
             state = state_of()
-            job.keep_state("descent", state.arrays, state.facts)
+            keep_state(job.writer, "descent", state.arrays, state.facts)
             last = time.monotonic()
 
     return solve_sgd(problem, chosen, partial(job.progress, what="steps"), job.threads, load, keep)

@@ -25,6 +25,7 @@ from lab.published.light.descent import (
     clamped_loss,
     descend,
 )
+from lab.published.state import keep_state, kept_state
 from workflow.decisions import light as decisions
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import BaseScene, decode_view, read_base_scene, view_pixels
@@ -144,7 +145,7 @@ def _descended(
     """Run the descent, from where an earlier run of the same job was killed."""
     count = int(emitter_of_face.max(initial=-1)) + 1
     options = PublishedOptions(steps=job.settings.emission.iterations, seed=job.seed)
-    state, kept = PublishedState.start(count), job.kept_state("descent")
+    state, kept = PublishedState.start(count), kept_state(job.writer, "descent")
     if kept is not None:
         state = PublishedState(**kept[0], step=kept[1]["step"], loss=tuple(kept[1]["loss"]))
     steps = options.total(len(pool.index))
@@ -164,7 +165,7 @@ def _descended(
 
 def _save(job: Job, state: PublishedState) -> None:
     arrays = {name: getattr(state, name) for name in ("stored", "keep", "sampling")}
-    job.keep_state("descent", arrays, {"step": state.step, "loss": list(state.loss)})
+    keep_state(job.writer, "descent", arrays, {"step": state.step, "loss": list(state.loss)})
 
 
 def _tracer(
