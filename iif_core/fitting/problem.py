@@ -78,16 +78,6 @@ class FitProblem:
             changed[name] = tuple(part[index] for part in value) if isinstance(value, tuple) else value[index]
         return replace(self, **changed)
 
-    def merged(self) -> FitProblem:
-        """Return the problem with the mean of the halves as the only one, as the paper's loss has it."""
-        if len(self.diffuse) == 1:
-            return self
-        means = {
-            name: (0.5 * (getattr(self, name)[0] + getattr(self, name)[1]),)  # keeps the dtype of the cache
-            for name in ("diffuse", "s0", "s1")
-        }
-        return replace(self, **means)
-
 
 @dataclass(frozen=True)
 class FitOptions:

@@ -9,7 +9,7 @@ from iif_core.camera.response import response
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.pixels import prepare_pixels
 from iif_core.reflectance.material import IDENTITY, apply_affines
-from lab.published.fitting.reference_loss import reference_loss, reference_options, reference_problem
+from lab.published.fitting.reference_loss import merged, reference_loss, reference_options, reference_problem
 from lab.published.fitting.sgd import SgdOptions, _gradient, fit_affines_sgd
 from tests.unit.planted_fit import planted, problem_of
 
@@ -27,7 +27,7 @@ def test_reference_loss_by_hand(ldr):
     affine = np.tile(IDENTITY, (4, 1)) * 0.9
     curve = response("gamma")
     got = reference_loss(ldr, affine, curve)
-    one = ldr.merged()
+    one = merged(ldr)
     value = apply_affines(affine, one.object_id, one.base)
     a, r, m = value[:, :3], value[:, 3], value[:, 4:]
     s0, s1 = (interpolate_levels(s[0], one.levels, r)[0] for s in (one.s0, one.s1))

@@ -14,6 +14,7 @@ import numpy as np
 from iif_core.camera.response import Response
 from iif_core.fitting.problem import FitProblem, FitResult
 from iif_core.reflectance.material import IDENTITY, LOWEST, NUMBERS, unclamped_material
+from lab.published.fitting.reference_loss import merged
 
 CLAMP = 0.9
 ROUGHNESS_WEIGHT = 1e-3
@@ -110,7 +111,7 @@ def loss_and_gradient(
     """Evaluate the published loss of some pixels (Eq. T.7).
 
     Args:
-        problem: with one half of the cache (`FitProblem.merged`), from photographs of sensor values.
+        problem: with one half of the cache (`merged`), from photographs of sensor values.
         rows: (n,) pixels, at least one.
         affine: (O, 16) numbers of the objects.
         response: curve of the camera.
@@ -175,9 +176,9 @@ def fit_published(
 
     `keep` is called with the state after each epoch. An interrupted fit continues from it and ends with the same result.
     """
-    opt, merged = options or PublishedOptions(), problem.merged()
-    seen = merged.object_id >= 0
-    used = merged if seen.all() else merged.take(np.flatnonzero(seen))  # a copy may not fit into memory
+    opt, mean = options or PublishedOptions(), merged(problem)
+    seen = mean.object_id >= 0
+    used = mean if seen.all() else mean.take(np.flatnonzero(seen))  # a copy may not fit into memory
     n, per_epoch = len(used.object_id), -(-len(used.object_id) // opt.batch)
     state = PublishedState.start(problem.n_objects, response) if state is None else state
     for after in descend(used, response, state, opt):

@@ -29,13 +29,22 @@ class ReferenceLoss:
     metallic: float
 
 
+def merged(problem: FitProblem) -> FitProblem:
+    """Return a problem with the mean of the halves as the only one, as the paper's loss has it."""
+    if len(problem.diffuse) == 1:
+        return problem
+    # Python's 0.5 keeps the dtype of the cache.
+    means = {name: (0.5 * (getattr(problem, name)[0] + getattr(problem, name)[1]),) for name in ("diffuse", "s0", "s1")}
+    return replace(problem, **means)
+
+
 def reference_problem(problem: FitProblem, response: Response) -> FitProblem:
     """Return the problem of the paper's loss: mean of the halves, values from 0.9 on as bounds."""
-    merged = problem.merged()
+    mean = merged(problem)
     if response.family == "identity":
-        return merged
+        return mean
     with np.errstate(invalid="ignore"):
-        return replace(merged, saturated=problem.saturated | (problem.value >= CLAMP), value=np.minimum(problem.value, CLAMP))
+        return replace(mean, saturated=problem.saturated | (problem.value >= CLAMP), value=np.minimum(problem.value, CLAMP))
 
 
 def reference_options(**changes: object) -> FitOptions:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from iif_core.camera.response import Response
-from iif_core.fitting import kernels
 from iif_core.fitting.descent import DescentState, GaussianPrior
 from iif_core.fitting.direct import FitProgress, result_of
 from iif_core.fitting.pixels import Pixels, penalties_of, prepare_pixels
@@ -21,6 +20,7 @@ from iif_core.fitting.selection import measure_texture
 from iif_core.fitting.tone import Tone
 from iif_core.reflectance.material import IDENTITY, NUMBERS
 from lab.published.adam import Moments
+from lab.published.fitting import kernels
 from lab.published.fitting.reference_loss import reference_loss, reference_options, reference_problem
 
 _EPSILON = 1e-8

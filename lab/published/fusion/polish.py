@@ -17,6 +17,7 @@ from iif_core.fusion.sums import CellSums, SegmentState, SegmentSums, sweep_summ
 from iif_core.numerics import laplace
 from iif_core.reflectance.material import IDENTITY
 from lab.published.fusion import matching
+from lab.published.fusion.kernels import channel_moments, choose
 
 _ALBEDO_ENTRIES = np.array([[0, 1, 2, 6], [1, 3, 4, 7], [2, 4, 5, 8], [6, 7, 8, 9]])  # of channel_moments, as a 4x4 matrix
 _PAIR_ENTRIES = np.array([[0, 1], [1, 2]])
@@ -65,7 +66,7 @@ def minimise_distribution_loss(
     cells = CellSums(run.problem.n_cells)
     for block in run.map_views(run.blocks):
         pixels[block.segments] = np.add.reduceat(block.weight, block.start[:-1], dtype=np.float64) if len(block.cell) else 0
-        planes = kernels.choose(block.values, chosen[block.segments], block.start)
+        planes = choose(block.values, chosen[block.segments], block.start)
         cells.add(block.cell, np.maximum(planes, LOWEST[:, None]), block.weight)
     texture, total_weight = cells.mean(texture), max(pixels.sum(), 1e-30)
     scale, _ = cell_scales(run, texture)
@@ -73,11 +74,11 @@ def minimise_distribution_loss(
     def one_view(view: int) -> tuple[Block, NDArray, NDArray, NDArray, float]:
         block = run.blocks(view)
         rows = block.segments
-        planes = kernels.choose(block.values, chosen[rows], block.start)
+        planes = choose(block.values, chosen[rows], block.start)
         target, b = kernels.texture_at(texture, block.cell), kernels.texture_at(scale, block.cell)
         mixed, b_ref, _ = reference_distribution(run, block, target)
         weight = block.weight * laplace.kl_weight(mixed - target, b_ref, b, floor).astype(np.float32) / 5
-        second, first = kernels.channel_moments(planes, target, weight, block.start)
+        second, first = channel_moments(planes, target, weight, block.start)
         strength = matching.REGULARISER * pixels[rows] / np.maximum(sums.usable[rows].sum(1), 1)
         state.affine[rows] = _penalised(state.affine[rows], chosen[rows], second, first, strength)
         mixed, b_ref, _ = reference_distribution(run, block, target)
