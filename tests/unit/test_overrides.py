@@ -143,8 +143,6 @@ def test_settings_take_ids_and_refuse_the_rest():
     ):
         with pytest.raises(ValidationError, match=words):
             settings_of(bad)
-    with pytest.raises(ValidationError, match="solver: direct"):
-        settings_of({"door": {"metallic": 0}}, affines={"model": "fipt"})
 
 
 def test_only_the_fit_and_what_follows_it_read_them():
