@@ -5,6 +5,7 @@ import os
 
 import numpy as np
 import pytest
+from support import TINY
 
 from iif_core.errors import InputError
 from iif_core.fusion.direct import solve_direct
@@ -34,12 +35,15 @@ VARIANTS = {
 
 
 @pytest.fixture(scope="module")
-def folder(finished, tmp_path_factory):
-    """A copy of the tiny scene; working folder for the stage."""
-    copy = finished.copy(tmp_path_factory.mktemp("variants") / "run")
-    before = os.getcwd()
-    os.chdir(copy.folder)
-    yield copy.folder
+def folder(llvm, tmp_path_factory):
+    """The tiny scene up to what stage base reads; working folder for the stage."""
+    folder, before = tmp_path_factory.mktemp("variants"), os.getcwd()
+    (folder / "config/scenes").mkdir(parents=True)
+    (folder / "config/scenes/tiny.yaml").write_text(TINY)
+    os.chdir(folder)
+    for stage in ("capture", "prior", "segmentation"):
+        run_stage(stage, "tiny", threads=2)
+    yield folder
     os.chdir(before)
 
 
