@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
+from lab.published.stages.affines import every_pixel
+from tests.unit.test_fit_pixels import VIEW, _pixels
 from workflow.artifacts import StageReader
 from workflow.runtime import fingerprint
 from workflow.runtime.job import run_stage
@@ -194,3 +196,9 @@ def test_linear_photographs_of_a_folder_are_refused(finished, tmp_path, monkeypa
     monkeypatch.setattr(CaptureReader, "is_hdr", True)
     with pytest.raises(InputError, match=r"emission.solver: published: .* set `capture: \{dynamic_range: ldr\}`"):
         run(tmp_path, ("emission",), monkeypatch)
+
+
+def test_every_pixel_of_an_object_is_taken_where_it_is_asked_for():
+    pixels, mixed = _pixels(), np.arange(10) == 9
+    chosen = every_pixel(4, mixed).of(pixels, VIEW)
+    np.testing.assert_array_equal(chosen, np.flatnonzero(pixels.valid & ~mixed[pixels.face]))

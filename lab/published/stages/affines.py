@@ -30,8 +30,12 @@ def run(job: Job) -> None:
 
 
 def _every(job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray) -> FitPixels:
-    """Take all pixels of the objects, those along their borders too."""
-    count = max(scene.n_objects, 1)
+    return every_pixel(scene.n_objects, mixed)
+
+
+def every_pixel(n_objects: int, mixed: np.ndarray) -> FitPixels:
+    """Take all pixels of the objects, those along their borders too; `mixed` as in `FitPixels`."""
+    count = max(n_objects, 1)
     return FitPixels(mixed, np.ones(count, bool), np.ones(count), 0)
 
 

@@ -213,7 +213,7 @@ def adam(parameters, first, second, gradient, live, factors) -> None:
         parameters, first, second, gradient: (n,) float32 p, m, v and g.
         live: (ceil(n / SPAN),) bool, spans whose moments are not all zero. A span that is not live and has no gradient is
             skipped; the formula would leave it unchanged too.
-        factors: numerics.adam.AdamFactors.
+        factors: lab.published.adam.AdamFactors.
     """
     beta1, beta2, rate, root, eps = factors
     zero = np.float32(0)
