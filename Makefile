@@ -34,7 +34,7 @@ help:
 	@echo 'make setup            only the environment, .venv'
 	@echo 'make lint | format    check | rewrite the style of Python and Snakemake files'
 	@echo 'make lock             resolve envs/*.in again (needs uv); lock-torch INDEX=<index> accepts more builds of torch'
-	@echo 'make licences | sbom  THIRD_PARTY.md | the bill of materials, sbom.json (need uv)'
+	@echo 'make licences | sbom  envs/licences.md | the bill of materials, sbom.json (need uv)'
 	@echo 'make docs             the documentation as a site, in site/'
 	@echo 'make clean            remove caches; results/ and scenes/ stay'
 

@@ -4,7 +4,7 @@
 # ///
 """Licences and bill of materials of everything that the locks name and that lies in the repository.
 
-    uv run envs/third_party.py                   writes docs/reference/licences.md (`make licences`)
+    uv run envs/third_party.py                   writes envs/licences.md (`make licences`)
     uv run envs/third_party.py --sbom sbom.json  writes a CycloneDX 1.6 document and checks it against its schema (`make sbom`)
 
 Licences are what the packages declare: in .venv where it has the locked version, else in the wheel on the public index.
@@ -30,7 +30,7 @@ import lock
 from packaging.utils import canonicalize_name
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-PAGE = REPOSITORY / "docs" / "reference" / "licences.md"
+PAGE = REPOSITORY / "envs" / "licences.md"
 LOCKS = {
     "requirements.lock": "always",
     "torch.lock": "always",
@@ -62,7 +62,7 @@ NOTES = {
     "libusb-package": "the package is Apache 2.0, the libusb in it LGPL 2.1 or later, loaded as a shared library",
     "numpy": "carries GCC's libgfortran and libquadmath (GPL 3 with the runtime exception, LGPL 2.1), as shared libraries",
     "pathspec": MPL,
-    "pulp": "carries the solver CBC, a program of its own under EPL 2.0",
+    "pulp": "carries the solver CBC, a separate program under EPL 2.0",
     "scipy": "carries GCC's libgfortran and libquadmath (GPL 3 with the runtime exception, LGPL 2.1), as shared libraries",
     "flip-evaluator": "carries GCC's libgomp (GPL 3 with the runtime exception); only tests import it",
     "torch": "carries GCC's libgomp (GPL 3 with the runtime exception)",

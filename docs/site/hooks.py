@@ -27,6 +27,7 @@ OUTSIDE = {
     "CHANGELOG.md": "development/changelog.md",
     "config/README.md": "reference/configuration.md",
     "envs/README.md": "development/environment.md",
+    "envs/licences.md": "reference/licences.md",
     "README.md": "index.md",
 }
 """Pages of the repository outside docs/ -> where they are on the site."""

@@ -14,7 +14,7 @@ from iif_core.errors import InputError
 from iif_core.numerics.color import luminance, srgb_from_linear
 
 STOPS = (0.25, 0.5, 1.0, 2.0, 4.0)
-"""Exposures of the five groups of views, brightest group first (docs/method/camera.md#simulated-photographs)."""
+"""Exposures of the five groups of views, brightest group first (lab/docs/simulated.md#photographs)."""
 
 _THIRD = 2.0 ** (-1 / 3)
 

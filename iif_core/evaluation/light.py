@@ -1,4 +1,4 @@
-"""How wrong the computed light is, judged with the true materials (docs/method/evaluation.md#error-of-the-light)."""
+"""How wrong the computed light is, judged with the true materials (lab/docs/evaluation.md#error-of-the-light)."""
 
 from __future__ import annotations
 

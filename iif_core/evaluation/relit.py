@@ -1,4 +1,4 @@
-"""Scores of a recovered room under new light against the source under the same light (docs/method/evaluation.md#relighting).
+"""Scores of a recovered room under new light against the source under the same light (lab/docs/evaluation.md#relighting).
 
 Pictures are linear radiance (H, W, 3). The exposure follows from the true pictures alone and holds for every method. PSNR, SSIM,
 FLIP and LPIPS are of sRGB(clip(exposure x radiance, 0, 1)), the relative error is of radiance.

@@ -90,7 +90,7 @@ def as_map(radiance: ArrayLike) -> Array:
     if not np.isfinite(radiance).all():
         raise InputError("environment radiance contains NaN or infinity")
     if radiance.min() < 0:
-        raise InputError("environment radiance is negative somewhere; radiance is never negative")
+        raise InputError(f"environment radiance is {radiance.min():g} somewhere; radiance is never negative")
     return radiance
 
 

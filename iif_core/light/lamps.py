@@ -1,5 +1,5 @@
 """Lamps of two descriptions of one room, matched by the surface that they share and by where they are
-(docs/method/evaluation.md#relighting)."""
+(lab/docs/evaluation.md#relighting)."""
 
 from __future__ import annotations
 

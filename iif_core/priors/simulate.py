@@ -1,4 +1,4 @@
-"""Prior `simulated`: ground truth with the errors of a single-view model (docs/method/priors.md#simulated, Eq. P.3 to P.9).
+"""Prior `simulated`: ground truth with the errors of a single-view model (lab/docs/simulated.md#simulated, Eq. P.3 to P.9).
 
 Every random number is a hash of (seed, name, object, view, sample) (Eq. P.2), so it does not depend on the order of evaluation,
 on the size of the image, or on which other objects are in view. `strength` multiplies every error; 0 returns the truth exactly.

@@ -1,7 +1,7 @@
 """In the place of stage `affines`, where `affines.model` is not `objects`: the material models of earlier methods.
 
 All read the same light and cached shading as `objects` and write the same artefacts. Where an original method would do worse for
-reasons unrelated to its idea, it is given what `objects` has (docs/method/fitting.md#earlier-methods-on-the-same-light).
+reasons unrelated to its idea, it is given what `objects` has (lab/docs/published.md#earlier-methods-on-the-same-light).
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-"""Memory and time of the published material fit over the number of pixels, on made-up light
-(docs/development/published.md#materials).
+"""Memory and time of the published material fit over the number of pixels, on made-up light (lab/docs/published.md#materials).
 
     python lab/benchmarks/published_memory.py [--pixels 1000000 5300000]
 

@@ -13,5 +13,5 @@ The way of the data, one module for each step:
     evaluation, scenes      errors and calibration on rooms that are kept back, and on captures with truth
     export, pack    weights for the product; everything that a GPU machine without a network needs
 
-`docs/development/prior.md` has one command for each step. No test scene and no built-in room is ever trained on.
+`lab/docs/prior.md` has one command for each step. No test scene and no built-in room is ever trained on.
 """

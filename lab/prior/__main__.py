@@ -1,4 +1,4 @@
-"""`python -m lab.prior <command>`: the laboratory of the learned prior (docs/development/prior.md)."""
+"""`python -m lab.prior <command>`: the laboratory of the learned prior (lab/docs/prior.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Losses of the network (docs/development/prior.md#losses).
+"""Losses of the network (lab/docs/prior.md#losses).
 
 The heads are alternatives: what counts is that one of them is right for an object in a view, as the fusion chooses one prediction
 per segment. Each head bears a share of the loss of an object that falls with its error there. While training proceeds, the shares

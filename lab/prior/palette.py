@@ -43,6 +43,18 @@ CLASS_SHARES = {
     "leaf": (0.90, 0.00, 0.00, 0.10, 0.00, 0.00, 0.00, 0.00, 0.00, 0.00),
 }
 """Shares of the classes of materials by place; `thin` are legs, handles, taps, rails; `flat` are prints and pictures."""
+MATTE_SHARES = {
+    "wall": 0.55,
+    "ceiling": 0.65,
+    "paint": 0.3,
+    "cloth": 0.6,
+    "wood": 0.15,
+    "stone": 0.2,
+    "print": 0.35,
+    "picture": 0.35,
+}
+"""Shares of the surfaces without any gloss (roughness 1): of painted, papered and pictured walls and ceilings, and of classes of
+materials elsewhere. Emulsion paint, plaster, paper, unglazed clay, untreated wood and most cloth are Lambertian to the eye."""
 _PRINTS = ("text", "spots", "ramp", "patches", "flakes", "zigzag", "checks", "stripes", "rug", "painting", "marble", "spines")
 
 
@@ -159,6 +171,11 @@ class Palette:
         low, high = [(0.05, 0.2), (0.2, 0.45), (0.45, 0.8), (0.8, 1.0)][self.rng.choice(4, p=[0.2, 0.28, 0.27, 0.25])]
         return float(self.rng.uniform(low, high))
 
+    def _rough(self, kind: str, place: str, gloss: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Return (1, 0, 0) for the share of the surfaces that are matte, `gloss` (r_0, r_t, r_s) for the others."""
+        papered = place in ("wall", "ceiling") and kind in ("paint", "print", "picture")
+        return (1.0, 0.0, 0.0) if self.rng.random() < MATTE_SHARES[place if papered else kind] else gloss
+
     def _cycles(self, low: float, high: float, count: int = 1) -> tuple[float, ...]:
         """(3,) frequencies between 10^low and 10^high, equal (count 1) or drawn apart (count 3)."""
         drawn = 10 ** self.rng.uniform(low, high, count)
@@ -168,9 +185,8 @@ class Palette:
         rng, u = self.rng, self.rng.random
         clouds = near(rng, base, (0.12 if place in ("wall", "ceiling") else 0.3) * u()) if u() < 0.7 else base
         rough = float(rng.uniform(0.4, 1.0)) if place in ("wall", "ceiling") else self._gloss()
-        return materials.row(
-            base, clouds, rough=(rough, float(rng.uniform(-0.05, 0.1)), 0), grain=self._cycles(-0.2, 1.4), **common
-        )
+        gloss = self._rough("paint", place, (rough, float(rng.uniform(-0.05, 0.1)), 0))
+        return materials.row(base, clouds, rough=gloss, grain=self._cycles(-0.2, 1.4), **_of(gloss, common))
 
     def _metal(self, base: Colour, place: str, common: dict) -> np.ndarray:
         rng, u = self.rng, self.rng.random
@@ -195,14 +211,15 @@ class Palette:
         rng, u = self.rng, self.rng.random
         first = of_tone(rng, "brown") if u() < 0.8 else base
         second = near(rng, tuple(0.6 * c for c in first), 0.25)
-        rough = self._gloss(), float(rng.uniform(0, 0.2))
+        rough = self._rough("wood", place, (self._gloss(), float(rng.uniform(0, 0.2)), 0.2))
+        common = _of(rough, common)
         if place in ("floor", "wall") and u() < 0.8:  # boards
             wide = float(rng.uniform(0.06, 0.22))
             size = wide * float(rng.uniform(5, 12)), wide
             joints, grain = near(rng, tuple(0.35 * c for c in first), 0.3), (0.9, float(rng.uniform(4, 12)), 7.0)
-            return materials.row(first, second, joints, rough=(*rough, 0.2), kind="cells", size=size, grain=grain, **common)
+            return materials.row(first, second, joints, rough=rough, kind="cells", size=size, grain=grain, **common)
         grain = tuple(float(s * rng.uniform(0.6, 2.0)) for s in rng.permutation([1.0, 9.0, 9.0]))
-        return materials.row(first, second, rough=(*rough, 0), kind="wood", grain=grain, **common)
+        return materials.row(first, second, rough=(*rough[:2], 0), kind="wood", grain=grain, **common)
 
     def _tiles(self, base: Colour, place: str, common: dict) -> np.ndarray:
         rng, u = self.rng, self.rng.random
@@ -215,7 +232,8 @@ class Palette:
 
     def _stone(self, base: Colour, place: str, common: dict) -> np.ndarray:
         rng = self.rng
-        rough = self._gloss(), float(rng.uniform(-0.05, 0.15)), 0.05
+        rough = self._rough("stone", place, (self._gloss(), float(rng.uniform(-0.05, 0.15)), 0.05))
+        common = _of(rough, common)
         more = {"kind": str(rng.choice(["marble", "terrazzo", "flakes"])), "fine": float(rng.uniform(1.2, 4))}
         veins = near(rng, base, 0.4), self._pick("thing")
         return materials.row(base, *veins, rough=rough, grain=self._cycles(0.2, 1.4, 3), **more, **common)
@@ -227,7 +245,8 @@ class Palette:
         edge = float(10 ** rng.uniform(-2.0, -0.7))
         size = (0.9, 0.6) if kind == "rug" else (edge * float(rng.uniform(0.6, 1.6)), edge)
         second = near(rng, base, 0.4) if u() < 0.6 else self._pick("thing")
-        rough = (float(rng.uniform(0.8, 1.0)), 0, 0)
+        rough = self._rough("cloth", place, (float(rng.uniform(0.7, 1.0)), 0, 0))
+        common = _of(rough, common)
         grain = self._cycles(0.3, 1.9)
         return materials.row(base, second, self._pick("thing"), rough=rough, kind=kind, size=size, grain=grain, **common)
 
@@ -239,7 +258,8 @@ class Palette:
         if kind == "text":  # dark on paper, or the reverse
             base = of_tone(rng, str(rng.choice(["white", "beige", "pastel", "dark"], p=[0.6, 0.2, 0.1, 0.1])))
         second = of_tone(rng, "dark") if kind == "text" and u() < 0.7 else self.colour("wild")
-        rough = self._gloss(), float(rng.uniform(-0.1, 0.2)), 0
+        rough = self._rough("print", place, (self._gloss(), float(rng.uniform(-0.1, 0.2)), 0))
+        common = _of(rough, common)
         grain = self._cycles(0.2, 1.5, 3)
         return materials.row(base, second, self.colour("wild"), rough=rough, kind=kind, size=size, grain=grain, **common)
 
@@ -276,6 +296,12 @@ class Palette:
         edge = (
             float(10 ** rng.uniform(-0.5, 0.5)) if place in ("wall", "floor", "ceiling") else float(10 ** rng.uniform(-0.9, 0.0))
         )
-        rough = float(np.clip(self._gloss(), 0.1, 0.95)), float(rng.uniform(0, 0.6)), 0
+        rough = self._rough("picture", place, (float(np.clip(self._gloss(), 0.1, 0.95)), float(rng.uniform(0, 0.6)), 0))
+        common = _of(rough, common)
         size = (edge, edge * float(rng.uniform(0.7, 1.4)))
         return materials.row(tuple(gain), rough=rough, kind="picture", size=size, layer=float(layer), **common)
+
+
+def _of(rough: tuple[float, float, float], common: dict) -> dict:
+    """Return the entries that all classes share; a matte surface has no uneven gloss."""
+    return common if rough[0] < 1 else common | {"uneven": 0.0}

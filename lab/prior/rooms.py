@@ -14,8 +14,9 @@ from lab.prior.materials import Materials
 from lab.prior.palette import Palette
 from lab.prior.shell import build_shell, light_from_outside, open_windows
 
-VERSION = 2
-"""Version of the generator, written into every room's file: 1 was the prototype. Raise it when rooms of a seed change."""
+VERSION = 3
+"""Version of the generator, written into every room's file: 1 was the prototype, 2 had no matte surface. Raise it when rooms of a
+seed change."""
 _STREAM = 0x726F6F6D
 
 

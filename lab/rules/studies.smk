@@ -1,4 +1,4 @@
-# Studies: their variants are derived scenes, which the stages make; a study collects their scores (docs/development/studies.md).
+# Studies: their variants are derived scenes, which the stages make; a study collects their scores (lab/docs/studies.md).
 
 
 rule study:

@@ -27,7 +27,7 @@ class Base(base.Base):
     polish: int = Field(25, ge=1, le=1000)
     """`direct`, `objective: distribution`: sweeps on the paper's loss."""
     preset: Literal["safe", "paper"] = "safe"
-    """`sgd`: `paper` = the published behaviour; `safe` = with the numerical safeguards of docs/method/fusion.md#schedules. Sets
+    """`sgd`: `paper` = the published behaviour; `safe` = with the numerical safeguards of lab/docs/published.md#schedules. Sets
     the defaults of the settings below."""
     texture: Literal["cells", "hashgrid"] | None = None
     """`sgd`: texture model; default: `cells`, `preset: paper` the hash grid."""
@@ -58,7 +58,7 @@ class Emission(light.Emission):
 
     solver: Literal["direct", "published", "published_repaired"] = "direct"
     """`direct`: non-negative least squares; `published`: the paper's method; `published_repaired`: without its errors
-    (docs/development/published.md#emission)."""
+    (lab/docs/published.md#emission)."""
     iterations: int | None = Field(None, ge=1)
     """`published`: steps of 8192 pixels each; default: one pass over all pixels."""
 
@@ -69,19 +69,19 @@ class Shading(light.Shading):
     method: Literal["shared_paths", "published"] = "shared_paths"
     """`shared_paths`: all lobes from one set of paths, diffuse light once for every surface cell; `published`: as the paper has
     it, at every pixel 256 paths for diffuse light and 64 to 128 for each of 6 levels, of one bounce, and the denoiser
-    (docs/development/published.md#shading)."""
+    (lab/docs/published.md#shading)."""
 
 
 class Affines(affines.Affines):
     """One affine map per object, and the camera response."""
 
     model: Literal["objects", "base", "object_mean", "texture_average", "fipt", "iris"] = "objects"
-    """`objects`: one affine map per object. Baselines under the same light (docs/development/studies.md): `base`: nothing is
+    """`objects`: one affine map per object. Baselines under the same light (lab/docs/studies.md): `base`: nothing is
     fitted; `object_mean`: mean prediction of each object; `texture_average`: mean photographed colour of each cell as albedo;
     `fipt`, `iris`: a free BRDF in every cell."""
     solver: Literal["direct", "sgd", "adam", "published"] = "direct"
     """With `objects`: `direct`: Gauss-Newton; `sgd`: stochastic gradient descent on the paper's loss; `adam`: Adam on the same
-    loss; `published`: the paper's descent to the letter (docs/development/published.md#materials). With `fipt`, `iris`: `direct`:
+    loss; `published`: the paper's descent to the letter (lab/docs/published.md#materials). With `fipt`, `iris`: `direct`:
     exact for every cell; `adam`: gradient descent on the same loss."""
     epochs: int = Field(3, ge=1)
     """`sgd`, `adam`, `published`: passes over the pixels; the step size falls to a fifth after each."""

@@ -1,4 +1,4 @@
-"""Sheets of pictures for papers: methods side by side, one row for each room and quantity (docs/development/studies.md#sheets).
+"""Sheets of pictures for papers: methods side by side, one row for each room and quantity (lab/docs/studies.md#sheets).
 
 Everything comes from stages that are finished; a variant that is not has no column, and nothing is computed.
 """

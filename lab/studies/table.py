@@ -399,7 +399,7 @@ def _costs_table(shown: pd.DataFrame, scenes: list[str], labels: dict[str, str])
 
 
 def _effects(study: study_files.Study, shown: pd.DataFrame, scenes: list[str]) -> list[str]:
-    """Rank the factors of a screening by their effect on each score and on the costs (docs/development/studies.md#designs)."""
+    """Rank the factors of a screening by their effect on each score and on the costs (lab/docs/studies.md#designs)."""
     from lab.studies.screening import elementary_effects, ranked
 
     design, lines = study.design, []

@@ -15,6 +15,7 @@ from email import message_from_string
 import pytest
 from packaging.specifiers import SpecifierSet
 
+from tests.errors import missing, named
 from workflow.runtime import doctor, native
 
 pytestmark = pytest.mark.front_door
@@ -82,7 +83,7 @@ def test_environment_of_another_checkout_is_left_alone(copy, tmp_path, clean_env
     stamp.write_text(f"lock torch {other}\nchecked\n")
     (copy / ".venv").symlink_to(other / ".venv")
     result = run(["bash", "envs/setup.sh"], copy, clean_environment)
-    assert result.returncode == 1 and f".venv is a link to the environment of {other}" in last_line(result.stderr)
+    assert result.returncode == 1 and not missing(last_line(result.stderr), ".venv", other)
     assert stamp.read_text().startswith("lock")
 
 
@@ -91,28 +92,27 @@ def test_too_old_python(copy, stand_in, clean_environment):
     result = run(["bash", "envs/setup.sh"], copy, clean_environment, PYTHON=old)
     assert result.returncode == 1
     assert len(result.stderr.strip().splitlines()) == 1
-    for text in ("Python 3.11 or newer", f"Python 3.9 ({old})", "PYTHON="):
-        assert text in result.stderr
+    named(result.stderr, "Python 3.11", "Python 3.9", old, "PYTHON=")
     assert not (copy / ".venv").exists()
 
 
 def test_absent_python(copy, clean_environment):
     result = run(["bash", "envs/setup.sh"], copy, clean_environment, PYTHON="/nowhere/python3")
-    assert result.returncode == 1 and "found none (tried: /nowhere/python3)" in result.stderr
+    assert result.returncode == 1 and not missing(result.stderr, "Python 3.11", "/nowhere/python3")
 
 
 def test_python_without_venv(copy, stand_in, clean_environment):
     stand_in("python3", 'case "$2" in *ensurepip*) exit 1;; *print*) echo 3.12;; esac\n')
     result = run(["bash", "envs/setup.sh"], copy, clean_environment)
     assert result.returncode == 1
-    assert "python3 (3.12) has no venv module" in result.stderr and "python3.12-venv" in result.stderr
+    named(result.stderr, "python3 (3.12)", "venv", "python3.12-venv")
 
 
 def test_small_disk(copy, stand_in, clean_environment):
     stand_in("df", "echo header; echo /dev/x 9999999 0 1048576 99% /\n")
     result = run(["bash", "envs/setup.sh"], copy, clean_environment, PYTHON=sys.executable)
     assert result.returncode == 1
-    assert "1024 MB of disk are free" in result.stderr and "4000 are needed" in result.stderr
+    named(result.stderr, "1024 MB", 4000)
 
 
 def wheel(folder, name, version, tag="py3-none-any"):
@@ -171,16 +171,16 @@ def installed_torch(copy):
 def test_torch_is_installed_by_its_hash_and_what_is_downloaded_is_said_first(copy, index):
     result = run(["bash", "envs/setup.sh"], copy, index("+cpu", listed=True))
     said = [line for line in result.stderr.splitlines() if line.startswith("setup: ")]
-    assert "1 packages (10 MB) and torch 2.13.0+cpu (3 MB); 532 MB of disk are needed, 20" in said[0]
-    assert said[1:3] == ["setup: installing the locked packages ...", "setup: installing torch 2.13.0+cpu ..."]
+    named(said[0], "10 MB", "torch 2.13.0+cpu", "3 MB", "532 MB")
+    assert said[2].startswith("setup: ") and "torch 2.13.0+cpu" in said[2]
     assert installed_torch(copy) == ["torch-2.13.0+cpu.dist-info"]
-    assert said[-1] == "setup: the environment is installed but does not work: see FAIL above"  # the packages are not there
+    assert "FAIL" in said[-1]  # the packages are not there
 
 
 def test_a_torch_with_another_hash_is_refused(copy, index):
     result = run(["bash", "envs/setup.sh"], copy, index("+cpu", listed=True, sha256="0" * 64))
     assert result.returncode == 1
-    assert "torch==2.13.0+cpu is not a file that the lock names, by its SHA-256" in last_line(result.stderr)
+    named(last_line(result.stderr), "torch==2.13.0+cpu", "SHA-256")
     assert not installed_torch(copy) and not (copy / ".venv/.setup").exists()
 
 
@@ -197,8 +197,7 @@ def test_a_torch_that_pip_does_not_foresee_needs_a_hash_too(copy, index):
     finally:
         python.unlink()
         python.symlink_to(real)
-    assert "(its size is not known)" in result.stderr
-    assert "is not a file that the lock names, by its SHA-256" in last_line(result.stderr)
+    named(last_line(result.stderr), "torch==2.13.0", "SHA-256")
     assert not installed_torch(copy)
 
 
@@ -207,10 +206,8 @@ def test_the_cuda_builds_need_more_and_all_of_it_by_hash(copy, index, tmp_path):
     _, right = wheel(tmp_path / "wheels", "iif_cuda", "1")
     (copy / "envs/torch-cuda.lock").write_text(f"iif-cuda==1 --hash=sha256:{right[::-1]}\n")
     result = run(["bash", "envs/setup.sh"], copy, environment)
-    assert "torch 2.13.0 (3 MB) with 1 packages for CUDA (2000 MB); 6532 MB of disk are needed" in result.stderr
-    assert "installing what torch needs for CUDA failed: iif-cuda==1 is not a file that the lock names" in last_line(
-        result.stderr
-    )
+    named(result.stderr, "torch 2.13.0", "3 MB", "2000 MB", "6532 MB")
+    named(last_line(result.stderr), "CUDA", "iif-cuda==1", "SHA-256")
 
 
 def test_a_build_that_is_not_listed_is_refused_unless_it_is_chosen(copy, index):
@@ -218,15 +215,10 @@ def test_a_build_that_is_not_listed_is_refused_unless_it_is_chosen(copy, index):
     environment = index("+cu126", listed=False)
     result = run(["bash", "envs/setup.sh"], copy, environment)
     assert result.returncode == 1 and len(result.stderr.strip().splitlines()) == 1
-    for text in (
-        "offers torch 2.13.0+cu126, which envs/torch.lock does not list",
-        "make lock-torch",
-        "TORCH=torch==2.13.0+cu126",
-    ):
-        assert text in result.stderr
+    named(result.stderr, "torch 2.13.0+cu126", "envs/torch.lock", "make lock-torch", "TORCH=torch==2.13.0+cu126")
     (copy / ".venv/.setup").write_text(f"lock torch {copy}\nchecked\n")
     result = run(["bash", "envs/setup.sh"], copy, environment, TORCH="torch==2.13.0+cu126")
-    assert "envs/torch.lock does not list torch 2.13.0+cu126 for this Python: it is installed without a hash" in result.stderr
+    named(result.stderr, "envs/torch.lock", "torch 2.13.0+cu126")
     assert installed_torch(copy) == ["torch-2.13.0+cu126.dist-info"]
 
 
@@ -244,7 +236,7 @@ def test_no_network(copy, stand_in, clean_environment):
             PIP_INDEX_URL="http://127.0.0.1:9/simple",
         )
         assert result.returncode == 1
-        assert "the package index cannot be reached" in last_line(result.stderr)
+        assert not missing(last_line(result.stderr), "pip config list")
         assert not (copy / ".venv" / ".setup").exists()
     assert "incomplete" in result.stderr
 
@@ -356,12 +348,12 @@ class TestMake:
         (tmp_path / folder).mkdir()
         result = run(["make", folder], tmp_path, clean_environment)
         assert result.returncode == 2 and "Nothing to be done" not in result.stdout + result.stderr
-        assert result.stderr.startswith(f"{folder}: ") and "not a target" in result.stderr
+        assert result.stderr.startswith(f"{folder}: ")
 
-    @pytest.mark.parametrize(("target", "hint"), [("scene/kitchen", "did you mean scenes/kitchen?"), ("kitchen", "make help")])
+    @pytest.mark.parametrize(("target", "hint"), [("scene/kitchen", "scenes/kitchen"), ("kitchen", "make help")])
     def test_an_unknown_target_is_answered(self, repository, clean_environment, target, hint):
         result = run(["make", target], repository, clean_environment)
-        assert result.returncode == 2 and result.stderr.startswith(f"{target}: not a target") and hint in result.stderr
+        assert result.returncode == 2 and result.stderr.startswith(f"{target}: ") and hint in result.stderr
 
     def test_suite_and_continuous_integration(self, repository, clean_environment):
         lines = self.commands(repository, clean_environment, "test")

@@ -12,6 +12,8 @@ import zipfile
 
 import pytest
 
+from tests.errors import missing, refused
+
 LOCKS = ("requirements.lock", "torch.lock", "torch-cuda.lock", "requirements-cluster.txt", "docs.txt")
 
 
@@ -49,7 +51,7 @@ def test_pins_are_in_their_locks(repository):
 
 def test_licences_of_every_locked_package_are_listed(repository):
     """With its version; and what lies in the repository is the file that the page means."""
-    page = (repository / "docs/reference/licences.md").read_text()
+    page = (repository / "envs/licences.md").read_text()
     rows = re.findall(r"^\| ([\w.-]+) \| (\d[^|]*) \| ([^|]+) \| (\w+) \|$", page, re.M)
     wanted = {(name, version) for lock in LOCKS for name, version in locked(repository, lock)}
     assert {(name, version) for name, version, _, _ in rows} == wanted
@@ -83,7 +85,7 @@ def test_an_image_check_that_cannot_be_says_why(repository, tmp_path, clean_envi
     environment = {**clean_environment, "PATH": f"{tmp_path}:{clean_environment['PATH']}"}
     command = ["bash", "envs/image-check.sh", "--engine"]
     result = subprocess.run(command, cwd=repository, env=environment, capture_output=True, text=True, timeout=60)
-    assert result.returncode == 77 and result.stderr.startswith("image-check: skipped: no Docker or Podman that reaches python:3")
+    assert result.returncode == 77 and not missing(result.stderr, "Docker", "Podman")
 
 
 @pytest.fixture
@@ -161,7 +163,7 @@ def test_an_index_adds_the_hashes_that_it_publishes(lock, torch_wheel, published
                 new = added(lock, before)
                 assert (new.name, new.sha256, new.size, new.unpacked) == (torch_wheel.name, digest, len(data), 300_000)
             else:
-                with pytest.raises(SystemExit, match="gives no SHA-256 of torch-"):
+                with refused(address, "SHA-256", torch_wheel.name, kind=SystemExit):
                     lock.add_builds(address)
                 assert lock.read_builds() == before
         finally:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from iif_core.camera.response import response
-from iif_core.errors import InputError
 from iif_core.fitting.cell_pixels import AlbedoSums, BlockLight, PixelRows
 from iif_core.fitting.levels import interpolate_levels
 from lab.baselines import loss as judge
@@ -16,6 +15,7 @@ from lab.baselines.direct import METALLIC_GRID, solve_direct
 from lab.baselines.loss import FIPT, IRIS, CellFit, CellOptions
 from lab.baselines.problem import CellSums
 from lab.baselines.texture import blocks_of, cell_albedo
+from tests.errors import refused
 
 LEVELS = np.array([0.02, 0.2, 0.5, 0.8, 1.0])
 FREE = CellOptions(regulariser=0.0, propagation=0.0)
@@ -277,18 +277,16 @@ def test_claimed_deviation_is_that_of_the_noise():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: CellSums(np.array([0, 3]), 2, LEVELS), ["object ids 0 ... 3", "0 ... 1"]),
-        (lambda: CellSums(np.array([0]), 1, np.array([1.0, 0.5])), ["two increasing roughness levels"]),
-        (lambda: CellOptions(part_weight="area"), ["'area'", "specular, gloss"]),
-        (lambda: solve_direct(CellSums(np.array([0]), 1, LEVELS).problem(), IRIS), ["prior albedo", "found none"]),
-        (lambda: plant(cells=3)[0].take(np.arange(3)).__class__(*[np.zeros(2)] * 8), ["diffuse has shape (2,)", "(2, 3)"]),
+        (lambda: CellSums(np.array([0, 3]), 2, LEVELS), ["object ids", "0 ... 3", "0 ... 1"]),
+        (lambda: CellSums(np.array([0]), 1, np.array([1.0, 0.5])), ["cells", "roughness levels"]),
+        (lambda: CellOptions(part_weight="area"), ["part_weight", "'area'", "specular, gloss"]),
+        (lambda: solve_direct(CellSums(np.array([0]), 1, LEVELS).problem(), IRIS), ["prior albedo", "(1, 3)"]),
+        (lambda: plant(cells=3)[0].take(np.arange(3)).__class__(*[np.zeros(2)] * 8), ["diffuse", "(2,)", "(2, 3)"]),
     ],
 )
 def test_bad_input(make, words):
-    with pytest.raises(InputError) as caught:
+    with refused(*words):
         make()
-    for word in words:
-        assert word in str(caught.value)
 
 
 def test_blocks_keep_objects_apart():

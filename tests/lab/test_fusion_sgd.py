@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from iif_core.errors import InputError
 from iif_core.fusion.direct import solve_direct
 from iif_core.fusion.kernels import IDENTITY, as_words
 from iif_core.fusion.options import FusionOptions
@@ -19,6 +18,7 @@ from lab.published.fusion.sgd import engine, kernels, solve
 from lab.published.fusion.sgd import pool as sgd_pool
 from lab.published.fusion.sgd.options import SgdOptions, sgd_options
 from lab.published.fusion.sgd.solve import SgdState, converged, solve_sgd
+from tests.errors import refused
 from tests.oracles import torch_sgd
 from tests.oracles.label_loss import label_loss
 from tests.unit.test_fusion_direct import OBJECTS, SIZE, oracle_psnr, planted, problem_of, seen, simulated, surface
@@ -526,23 +526,23 @@ def test_jitter_moves_the_points():
 
 def test_bad_calls_are_refused():
     problem, _ = simulated()
-    with pytest.raises(InputError, match="surface points"):
+    with refused("base sgd", "FusionProblem.point"):
         solve_sgd(problem, sgd_options("paper"))
-    with pytest.raises(InputError, match="no pixel"):
+    with refused("base sgd", "cell", "segment", "weight"):
         solve_sgd(FusionProblem([], [], [], 3, np.zeros(3, int), np.zeros(0, int)), QUICK)
-    with pytest.raises(InputError, match="MiB"):
+    with refused("base sgd", "1 of 8", "memory"):
         solve_sgd(problem, replace(QUICK, memory=1000))
-    with pytest.raises(InputError, match="two views"):
+    with refused("segment 0"):
         solve_sgd(replace(problem, segment_of_pixel=[problem.segment_of_pixel[0]] * 8), QUICK)
-    with pytest.raises(InputError, match="cell id"):
+    with refused("view 0", "cell id", 10):
         solve_sgd(replace(problem, n_cells=10, object_of_cell=np.zeros(10, int)), QUICK)
     fewer = [problem.predictions[0], *(p[:3] for p in problem.predictions[1:])]
-    with pytest.raises(InputError, match="same number"):
+    with refused("view 1", 3, "view 0", 6):
         solve_sgd(replace(problem, predictions=fewer), QUICK)
     assert OBJECTS == 4
 
 
 def test_a_loss_that_explodes_is_named():
     problem, _ = simulated()
-    with pytest.raises(InputError, match="not finite at step"):
+    with refused("base sgd", "step 1", "learning_rate"):
         solve_sgd(problem, replace(QUICK, learning_rate=1e30))

@@ -11,6 +11,7 @@ from iif_core.numerics.color import srgb_from_linear
 from iif_core.numerics.xp import NUMPY
 from lab.prior import materials, palette
 from lab.prior.assets import Assets, load, measured_materials
+from tests.errors import refused
 from workflow.sources.rooms import patterns
 
 
@@ -60,7 +61,7 @@ def test_a_row_has_every_entry_that_the_products_patterns_read():
     albedo, rough, _ = patterns.evaluate(NUMPY, np.zeros((3, 1)), column)
     assert asked <= set(materials.COLUMNS) and len(asked) > 30
     assert np.allclose(np.ravel(albedo), (0.1, 0.2, 0.3)) and np.allclose(rough, 0.6)
-    with pytest.raises(TypeError, match="unknown entries"):
+    with refused("row", "'shine'", "fine", "layer", kind=TypeError):
         materials.row((0, 0, 0), shine=1.0)
 
 
@@ -86,6 +87,22 @@ def test_walls_and_ceilings_are_mostly_grey_and_bright():
     assert np.mean(np.array(saturation) < 0.35) > 0.85
     assert np.mean(np.array(value) > 0.7) > 0.6
     assert np.max(saturation) > 0.5, "saturated walls must occur, if rarely"
+
+
+def test_half_of_the_walls_and_most_ceilings_have_no_gloss_and_few_things(coloured):
+    palettes = [palette.Palette(np.random.default_rng(seed), coloured) for seed in range(40)]
+    matte = {
+        place: np.mean([[materials.entry(p.material(place), "r_0") == 1 for _ in range(20)] for p in palettes])
+        for place in ("wall", "ceiling", "thing", "thin")
+    }
+    assert 0.35 < matte["wall"] < 0.6 < matte["ceiling"] < 0.75
+    assert 0.1 < matte["thing"] < 0.35 and matte["thin"] < 0.15
+
+
+def test_what_has_no_gloss_has_none_anywhere(coloured):
+    drawn = [palette.Palette(np.random.default_rng(seed), coloured).material("wall") for seed in range(60)]
+    for row in (row for row in drawn if materials.entry(row, "r_0") == 1):
+        assert materials.entry(row, "r_t") == materials.entry(row, "r_s") == materials.entry(row, "uneven") == 0
 
 
 @pytest.mark.parametrize("table", [palette.TONE_SHARES, palette.CLASS_SHARES])
@@ -118,7 +135,7 @@ def test_assets_survive_the_file_and_a_folder_without_any_is_refused(tmp_path, c
         assert a.shape == b.shape and np.abs(a.astype(int) - b).mean() < 4, "JPEG keeps them roughly"
     assert np.allclose(again.skies[0], sky, rtol=1e-3)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(FileNotFoundError, match="neither textures"):
+    with refused(tmp_path / "empty", "textures/*.jpg", "hdri/*.exr", kind=FileNotFoundError):
         load(tmp_path / "empty")
 
 

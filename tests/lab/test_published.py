@@ -1,5 +1,4 @@
-"""The published method: light of one bounce, its descent to emitters, its descent to materials
-(docs/development/published.md)."""
+"""The published method: light of one bounce, its descent to emitters, its descent to materials (lab/docs/published.md)."""
 
 import numpy as np
 import pytest

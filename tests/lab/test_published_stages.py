@@ -8,8 +8,8 @@ import shutil
 import numpy as np
 import pytest
 
-from iif_core.errors import InputError
 from lab.published.stages.affines import every_pixel
+from tests.errors import refused
 from tests.unit.test_fit_pixels import VIEW, _pixels
 from workflow.artifacts import StageReader
 from workflow.runtime import fingerprint
@@ -185,7 +185,7 @@ def test_estimated_exposures_are_refused(finished, tmp_path, monkeypatch):
         self.facts["exposure_estimated"] = True
 
     monkeypatch.setattr(CaptureReader, "__init__", estimated)
-    with pytest.raises(InputError, match=r"emission.solver: published: .* known exposures"):
+    with refused("emission.solver: published", "exposures"):
         run(tmp_path, ("emission",), monkeypatch)
 
 
@@ -194,7 +194,7 @@ def test_linear_photographs_of_a_folder_are_refused(finished, tmp_path, monkeypa
     folder, _ = finished
     shutil.copytree(folder / "results", tmp_path / "results")
     monkeypatch.setattr(CaptureReader, "is_hdr", True)
-    with pytest.raises(InputError, match=r"emission.solver: published: .* set `capture: \{dynamic_range: ldr\}`"):
+    with refused("emission.solver: published", "capture: {dynamic_range: ldr}"):
         run(tmp_path, ("emission",), monkeypatch)
 
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iif_core.errors import InputError
 from iif_core.fusion.problem import LOWEST, FusionProblem, usable_pixels
 from lab.published.fusion.reference_loss import identity_regulariser, reference_loss
+from tests.errors import refused
 from tests.oracles.label_loss import label_loss
 
 LOW = LOWEST.astype(np.float64)
@@ -207,5 +207,5 @@ def test_predictions_that_are_not_finite_are_left_out():
 
 def test_nothing_usable_is_an_error():
     problem, value, scale, corrections, weight = random_state()
-    with pytest.raises(InputError, match="no pixel"):
+    with refused("reference loss", "cell", "segment", "weight"):
         reference_loss(replace(problem, weight=[0 * w for w in problem.weight]), value, scale, corrections, weight)

@@ -4,9 +4,9 @@ import math
 import pandas as pd
 import pytest
 
-from iif_core.errors import InputError
 from lab.studies import regret
 from lab.studies.table import KEPT
+from tests.errors import refused
 from workflow.settings.study_files import Opposite, load_study
 
 SCORES = [("albedo", "psnr", "scaled"), ("roughness", "l2", "raw"), ("rgb", "psnr", "raw")]
@@ -102,7 +102,7 @@ def test_claims_are_medians_of_the_rooms_and_old_tables_lack_costs(tmp_path):
         "environment": {"left_out": {"held_out_db": [-1.0, -1.0, -1.0], "cpu_seconds": 0.1, "max_rss_mb": 0.0, "rooms": 1}},
     }
     study = load_study("regret").model_copy(update={"opposites": OPPOSITES})
-    with pytest.raises(InputError, match="not found; `python -m lab study regret --keep"):
+    with refused("none.csv", "python -m lab study regret --keep"):
         regret.write_claims(study, tmp_path / "none.csv", tmp_path / "claims.json")
     table.to_csv(tmp_path / "rows.csv", index=False)
     regret.write_claims(study, tmp_path / "rows.csv", tmp_path / "claims.json")

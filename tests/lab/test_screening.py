@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from iif_core.errors import InputError
 from lab.studies.screening import elementary_effects, ranked, trajectories
+from tests.errors import refused
 from workflow.settings import study_files
 from workflow.settings.study_files import MORRIS_LEVELS as LEVELS
 
@@ -54,14 +54,14 @@ def test_runs_become_variants_and_a_run_that_is_there_twice_is_one(tmp_path, mon
 
 @pytest.mark.parametrize("runs", [["00", "10", "12"], ["00", "22", "20"], ["00", "20", "00"], ["00", "00", "02"]])
 def test_runs_that_are_no_trajectories_are_refused(tmp_path, monkeypatch, runs):
-    with pytest.raises(InputError, match=f"those from '{runs[0]}' on are no trajectory"):
+    with refused("config/studies/s.yaml", "design.runs", f"'{runs[0]}'"):
         study(tmp_path, monkeypatch, [*runs, "00", "20", "22"])
 
 
 def test_too_few_runs_for_the_trajectories_are_refused(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match="found 3, which are 9 runs; there are 6"):
+    with refused("s.yaml", "design.trajectories", 3, 9, 6):
         study(tmp_path, monkeypatch, ["00", "20", "22"] * 2, 3)
-    with pytest.raises(InputError, match="needed are 2 to 19"):
+    with refused(20, 2, 19):
         trajectories(FACTORS, 20)
 
 

@@ -8,11 +8,11 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from iif_core.errors import InputError
 from iif_core.fusion.uncertainty import CALIBRATION
 from lab.studies import table as study_table
+from tests.errors import refused
 from workflow import settings
-from workflow.artifacts import StageWriter
+from workflow.artifacts import DamagedArtefact, StageWriter
 from workflow.runtime import fingerprint as fp
 from workflow.runtime.job import Job
 from workflow.runtime.timings import read_parts
@@ -75,13 +75,13 @@ def test_an_entry_with_a_source_needs_no_scene_file(folder):
     room = settings.load("r--a-mean-2-s1")
     assert (room.source.scene, room.prior.shared, room.capture.views, room.prior.seed) == ("sky", 3.0, 3, 1)
     assert len(study_table.plan("a", "draft").cells) == 12
-    with pytest.raises(InputError, match=r"config/scenes/r.yaml: not found"):
+    with refused("config/scenes/r.yaml", "t"):
         settings.load("r")
     folder("studies/scenes", SHARED + own.replace("scene: sky", "scene: sku"))
-    with pytest.raises(InputError, match=r"config/studies/scenes.yaml, r: `source.*sku"):
+    with refused("config/studies/scenes.yaml", "r", "source.scene", "'sku'"):
         settings.load("r--s0")
     folder("studies/scenes", SHARED + "r: {prior: {kind: simulated}}\n")
-    with pytest.raises(InputError, match="scenes.yaml: r: no such scene, and no `source` here"):
+    with refused("config/studies/scenes.yaml", "r", "source", "t"):
         settings.load("t--s0")
 
 
@@ -176,32 +176,30 @@ def test_a_variant_chooses_a_preset_over_what_the_study_shares(folder):
     theirs = settings.load("t--a-theirs-s0")  # what the scene sets for another method is not part of the published one
     assert (theirs.base.texture, theirs.base.iterations, theirs.affines.epochs) == (None, None, 3)
     folder("scenes/t", SCENE.replace("capture: {", "capture: {dynamic_range: hdr, "))
-    with pytest.raises(InputError, match=r"a.yaml, variant theirs: .*8-bit photographs"):
+    with refused("a.yaml, variant theirs", "emission: solver: published", "capture: {dynamic_range: ldr}"):
         settings.load("t--a-theirs-s0")
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (LATE + "reference: best\n", ["`reference: best`: no such variant", "first, same"]),
-        (LATE + "repeats: {best: [3]}\n", ["`repeats.best`: no such variant", "first, same"]),
-        (LATE + "repeats: {far: []}\n", ["`repeats.far`", "found []"]),
-        (LATE.replace("affines]", "affine]"), ["`costs`: affine is no stage", "affines"]),
-        (LATE.replace("scores: metrics", "scores: report"), ["`scores`", "'report'", "'metrics'"]),
-        (LATE.replace("[raw, scaled]", "[raw, best]"), ["`protocols.1`", "'best'"]),
-        (LATE.replace("predictions: 2}", "predictions: 0}"), ["late.yaml, `common`", "`base.predictions`: found 0"]),
+        (LATE + "reference: best\n", ["reference: best", "first, same, other, far"]),
+        (LATE + "repeats: {best: [3]}\n", ["repeats.best", "first, same, other, far"]),
+        (LATE + "repeats: {far: []}\n", ["repeats.far", "[]", 1]),
+        (LATE.replace("affines]", "affine]"), ["costs", "affine", "affines"]),
+        (LATE.replace("scores: metrics", "scores: report"), ["scores", "'report'", "'metrics'"]),
+        (LATE.replace("[raw, scaled]", "[raw, best]"), ["protocols.1", "'best'", "'raw'"]),
+        (LATE.replace("predictions: 2}", "predictions: 0}"), ["late.yaml", "common", "base.predictions", 0, 1]),
         (
             LATE.replace("model: object_mean", "model: fipt, solver: sgd"),
-            ["late.yaml, variant other", "`solver: sgd` does not fit `model: fipt`"],
+            ["late.yaml, variant other", "solver: sgd", "model: fipt", "direct, adam"],
         ),
     ],
 )
 def test_mistakes_in_a_study_of_the_result(folder, text, words):
     folder("studies/late", text)
-    with pytest.raises(InputError) as caught:
+    with refused("config/studies/late.yaml", *words):
         study_table.plan("late", "draft")
-    for word in words:
-        assert word in str(caught.value)
 
 
 def test_a_variant_has_further_seeds(folder):
@@ -254,7 +252,7 @@ def test_table_of_the_result_reads_the_row_of_each_variant(folder, tmp_path):
     assert "10.60 (scaled)" in Path("results/studies/late.md").read_text()
     assert Path("results/studies/late.png").stat().st_size > 5000
     folder("studies/late", LATE.replace("[0, 1]", "[0]").replace("prior_k0", "prior_k9"))
-    with pytest.raises(InputError, match="`row: prior_k9`.*which has prior_k0, result"):
+    with refused("row: prior_k9", "variants.parquet", "prior_k0, result"):
         study_table.table("late", "draft")
 
 
@@ -359,7 +357,7 @@ def test_scenes_can_be_the_rows_of_the_page():
 
 def test_a_shared_result_is_read_from_where_it_lies(folder, tmp_path):
     job = Job("segmentation", "t--a-full-s1", "draft", 1)
-    with pytest.raises(InputError, match="results/t--s0/capture/manifest.json: missing"):
+    with refused("results/t--s0/capture/manifest.json", kind=DamagedArtefact):
         job.read("capture")
 
 
@@ -374,65 +372,64 @@ def test_grids_are_variants(folder):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (STUDY + "colour: 1\n", ["config/studies/a.yaml: `colour`: unknown key", "Allowed here: title, scenes"]),
-        (STUDY.replace("label:", "lable:"), ["`variants.mean-2.lable`: unknown key", "Did you mean `label`?"]),
-        (STUDY + "plot: {kind: pie}\n", ["`plot.kind`", "'pie'", "'bars'"]),
-        (STUDY + "plot: {kidn: bars}\n", ["`plot.kidn`", "Did you mean `kind`?"]),
-        (STUDY + "plot: {kind: line, x: base.sweeps}\n", ["no variant sets 'base.sweeps'", "base.variant"]),
-        (STUDY.replace("mean-2", "me an"), ["'me an'", "allowed are letters"]),
-        (STUDY.replace("scenes: [t]", "scenes: [tt]"), ["`scenes`: tt is not in config/studies/scenes.yaml", "Did you mean t?"]),
-        (STUDY.replace("scenes: [t]", "scenes: []"), ["`scenes`", "at least 1"]),
-        (STUDY.replace("scenes: [t]\n", ""), ["`scenes`: missing"]),
-        (STUDY + "show: [albedo/pnsr]\n", ["`show`", "'albedo/pnsr'", "psnr"]),
-        (STUDY + "paper: {best: {protocol: raw, values: {}}}\n", ["`paper.best`: no such variant", "full, mean-2"]),
-        (STUDY + "paper: {full: {protocol: raw, values: {albedo: 3}}}\n", ["paper.full.values", "'albedo'"]),
-        (STUDY + "paper: {full: {protocol: best, values: {}}}\n", ["`paper.full.protocol`", "'best'"]),
-        (STUDY + "grids: [{base: [1]}]\n", ["`grids.0`", "<section>.<key>"]),
-        ("title: x\nscenes: [t]\n", ["no variants"]),
-        ("title: x\n  scenes: [t]\n", ["a.yaml, line 2", "not valid YAML"]),
+        (STUDY + "colour: 1\n", ["config/studies/a.yaml", "colour", "title, scenes"]),
+        (STUDY.replace("label:", "lable:"), ["variants.mean-2.lable", "label, row, overrides, preset"]),
+        (STUDY + "plot: {kind: pie}\n", ["plot.kind", "'pie'", "'bars'"]),
+        (STUDY + "plot: {kidn: bars}\n", ["plot.kidn", "kind, x, group, history, log"]),
+        (STUDY + "plot: {kind: line, x: base.sweeps}\n", ["plot", "'base.sweeps'", "base.variant"]),
+        (STUDY.replace("mean-2", "me an"), ["variants", "'me an'"]),
+        (STUDY.replace("scenes: [t]", "scenes: [tt]"), ["scenes", "tt", "config/studies/scenes.yaml", "t"]),
+        (STUDY.replace("scenes: [t]", "scenes: []"), ["scenes", "[]", 1]),
+        (STUDY.replace("scenes: [t]\n", ""), ["scenes", "config/studies/aggregation.yaml"]),
+        (STUDY + "show: [albedo/pnsr]\n", ["show", "'albedo/pnsr'", "psnr"]),
+        (STUDY + "paper: {best: {protocol: raw, values: {}}}\n", ["paper.best", "full, mean-2"]),
+        (
+            STUDY + "paper: {full: {protocol: raw, values: {albedo: 3}}}\n",
+            ["paper.full.values", "'albedo'", "<quantity>/<metric>"],
+        ),
+        (STUDY + "paper: {full: {protocol: best, values: {}}}\n", ["paper.full.protocol", "'best'", "'raw'"]),
+        (STUDY + "grids: [{base: [1]}]\n", ["grids.0", "base: [1]", "<section>.<key>"]),
+        ("title: x\nscenes: [t]\n", ["variants: {<name>: {overrides: ...}}", "grids"]),
+        ("title: x\n  scenes: [t]\n", ["a.yaml, line 2", "YAML"]),
     ],
 )
 def test_mistakes_in_a_study(folder, text, words):
     folder("studies/a", text)
-    with pytest.raises(InputError) as caught:
+    with refused("config/studies/a.yaml", *words):
         study_files.load_study("a")
-    for word in words:
-        assert word in str(caught.value)
 
 
 def test_settings_are_blamed_on_the_file_that_spoils_them(folder):
     folder("studies/a", STUDY.replace("object_mean", "mode"))
-    with pytest.raises(InputError, match=r"config/studies/a.yaml, variant mean-2: `base.variant`: found 'mode'"):
+    with refused("config/studies/a.yaml, variant mean-2", "base.variant", "'mode'", "'full'"):
         study_table.plan("a", "draft")
     folder("studies/scenes", "t: {capture: {widht: 64}}\n")
-    with pytest.raises(InputError, match=r"config/studies/scenes.yaml, t: `capture.widht`: unknown key"):
+    with refused("config/studies/scenes.yaml, t", "capture.widht", "width"):
         study_table.plan("a", "draft")
     folder("scenes/t", SCENE + "sed: 3\n")
-    with pytest.raises(InputError, match=r"config/scenes/t.yaml: `sed`: unknown key"):
+    with refused("config/scenes/t.yaml", "sed", "seed"):
         study_table.plan("a", "draft")
 
 
 @pytest.mark.parametrize(
     ("scene", "words"),
     [
-        ("t--a-mean-s0", ["config/studies/a.yaml: no variant mean", "Did you mean mean-2?"]),
-        ("t--b-full-s0", ["config/studies/b.yaml: not found", "Known studies: a"]),
-        ("u--a-full-s0", ["config/scenes/u.yaml: not found"]),
+        ("t--a-mean-s0", ["config/studies/a.yaml", "mean", "full, mean-2"]),
+        ("t--b-full-s0", ["config/studies/b.yaml", "a"]),
+        ("u--a-full-s0", ["config/scenes/u.yaml", "t"]),
     ],
 )
 def test_unknown_derived_scenes(folder, scene, words):
-    with pytest.raises(InputError) as caught:
+    with refused(*words):
         settings.load(scene)
-    for word in words:
-        assert word in str(caught.value)
 
 
 def test_unlisted_scenes(folder):
     folder("scenes/u", SCENE)
-    with pytest.raises(InputError, match="scenes.yaml: u is not listed. Known there: t"):
+    with refused("config/studies/scenes.yaml: u", "t"):
         settings.load("u--a-full-s0")
     folder("studies/scenes", SHARED + "kitchn: {}\n")
-    with pytest.raises(InputError, match="kitchn: no such scene"):
+    with refused("config/studies/scenes.yaml", "kitchn", "source"):
         study_files.load_study("a")
 
 

@@ -14,6 +14,7 @@ from iif_core.fitting.problem import FitOptions, FitProblem, albedo_uncertainty
 from iif_core.fitting.selection import EVIDENCE_DISCOUNT, ROUGHNESS_GRID, Choice, Profile, choose_kinds
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
 from iif_core.reflectance.material import GAINS, IDENTITY, MATTE_ROUGHNESS, apply_affines, unclamped_material
+from tests.errors import refused
 from tests.unit.planted_fit import LEVELS, problem_of
 
 EXACT = FitOptions(
@@ -310,13 +311,13 @@ def test_an_uncertain_level_is_averaged_with_the_prior():
 
 
 def test_scale_refused():
-    for wrong in (
-        {"kind": "other"},
-        {"kind": "mean_albedo"},
-        {"kind": "white_patch", "albedo": 0.9},
-        {"kind": "lamp", "factor": 0},
+    for wrong, named in (
+        ({"kind": "other"}, ("'other'", "mean_albedo")),
+        ({"kind": "mean_albedo"}, ("mean_albedo", "0.0", 1)),
+        ({"kind": "white_patch", "albedo": 0.9}, ("white_patch", "pixels")),
+        ({"kind": "lamp", "factor": 0}, ("lamp", 0)),
     ):
-        with pytest.raises(InputError, match="scale"):
+        with refused("scale", *named):
             Gauge(**wrong)
 
 

@@ -3,7 +3,6 @@
 import json
 import logging
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from iif_core.errors import InputError
+from tests.errors import named, refused
 from workflow.artifacts import DamagedArtefact, StageReader, StageWriter, files, locks, scratch, sound, stamps
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.files import sha256_of, write_parquet
@@ -77,7 +76,7 @@ def test_an_error_of_the_disk_is_not_called_damage(stage, monkeypatch, name, rea
 
     with pytest.raises(OSError, match="Input/output error"):
         fails(OSError(5, "Input/output error"))(name)
-    with pytest.raises(DamagedArtefact, match=r"not readable as (EXR|Parquet) \(no end\)"):
+    with refused(name, "snakemake --cores 2 scenes/s --forcerun base", kind=DamagedArtefact):
         fails(OSError("no end"))(name)
 
 
@@ -113,7 +112,7 @@ def test_damage_is_found_and_named(stage, tmp_path, name, harm):
         path.write_bytes(data[: len(data) // 2])
     else:
         path.unlink()
-    with pytest.raises(DamagedArtefact, match=r"made by rule base; rebuild with: snakemake"):
+    with refused(name, "snakemake --cores 2 scenes/s --forcerun base", kind=DamagedArtefact):
         StageReader(folder, "base", "s").path(name)
     lines = list(damaged(tmp_path))
     assert len(lines) == 1 and name in lines[0]
@@ -140,14 +139,14 @@ def test_unknown_schema_is_refused(stage):
     manifest = stage[0] / "manifest.json"
     document = json.loads(manifest.read_text()) | {"schema": "iif.stage/99"}
     manifest.write_text(json.dumps(document))
-    with pytest.raises(DamagedArtefact, match="iif.stage/99"):
+    with refused("manifest.json", "iif.stage/99", "iif.stage/2", kind=DamagedArtefact):
         StageReader(stage[0], "base", "s")
 
 
 def test_unfinished_stage_is_refused(tmp_path):
     writer = StageWriter(tmp_path / "results/s/base", provenance())
     writer.json("base.json", {})
-    with pytest.raises(DamagedArtefact, match="not finished"):
+    with refused("results/s/base/manifest.json", "snakemake --cores 2", kind=DamagedArtefact):
         StageReader(tmp_path / "results/s/base", "base", "s")
 
 
@@ -217,10 +216,10 @@ def test_names_that_leave_the_folder_are_refused(tmp_path, name):
         lambda: writer.bytes(name, b"x"),
         lambda: writer.channels(name),
     ):
-        with pytest.raises(InputError, match="would leave this folder"):
+        with refused(tmp_path / "stage", repr(name)):
             write()
     for part in (lambda: writer.part_done("../../evil", [], {}), lambda: writer.part_kept("../../evil")):
-        with pytest.raises(InputError, match="would leave this folder"):
+        with refused(tmp_path / "stage", "'unfinished/../../evil.json'"):
             part()
     assert sorted(path for path in tmp_path.rglob("*")) == before and not Path("/tmp/evil").exists()
 
@@ -264,7 +263,7 @@ def test_nothing_is_made_where_a_link_leads_out(tmp_path, monkeypatch, link):
     )
     before = sorted(Path().rglob("*"))
     for begin in (*plans, job, *([stage] if link == "results/s/base" else [])):
-        with pytest.raises(InputError, match=rf"^{re.escape(link)}: a symbolic link to .* Remove the link"):
+        with refused(f"{link}: "):
             begin()
     assert sorted(Path().rglob("*")) == before and outside.read_text() == "mine"
 
@@ -297,7 +296,7 @@ def test_a_file_is_never_written_through_a_link(tmp_path, monkeypatch):
     root = logging.getLogger()
     monkeypatch.setattr(root, "handlers", [])
     for opens in (lambda: configure_logging(log), lambda: locks.briefly(log).__enter__()):
-        with pytest.raises(InputError, match=r"base\.log: a symbolic link to"):
+        with refused(log, outside):
             opens()
     assert outside.read_text() == "mine"
 
@@ -305,9 +304,9 @@ def test_a_file_is_never_written_through_a_link(tmp_path, monkeypatch):
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_non_finite_values_are_not_written(tmp_path, bad):
     writer = StageWriter(tmp_path, provenance())
-    with pytest.raises(ValueError, match="non-finite"):
+    with refused("x.exr", "channel a", 1, kind=ValueError):
         writer.exr("x.exr", {"a": np.array([[bad]], np.float32)})
-    with pytest.raises(ValueError, match="non-finite"):
+    with refused("x.parquet", "column a", kind=ValueError):
         writer.table("x.parquet", {"a": np.array([bad])})
     assert not list(tmp_path.glob("*.exr")) and not list(tmp_path.glob("*.parquet"))
 
@@ -344,10 +343,8 @@ def test_a_stage_from_which_others_were_made_must_be_there(tmp_path, whole):
     gone = tmp_path / "results/s/base"
     shutil.rmtree(gone) if whole else (gone / "manifest.json").unlink()
     (line,) = damaged(tmp_path)
-    assert line == (
-        f"{gone}/manifest.json: missing, although {tmp_path}/results/s/report was made from it; rebuild with:"
-        " snakemake --cores 2 results/s/base/manifest.json --config quality=paper"
-    )
+    named(line, gone / "manifest.json", tmp_path / "results/s/report")
+    assert line.endswith("snakemake --cores 2 results/s/base/manifest.json --config quality=paper")
 
 
 def test_results_from_which_something_was_published_must_be_there(tmp_path):
@@ -356,10 +353,10 @@ def test_results_from_which_something_was_published_must_be_there(tmp_path):
     assert list(damaged(tmp_path)) == []
     shutil.rmtree(tmp_path / "results/s/publish")
     (line,) = damaged(tmp_path)
-    assert "results/s/publish/manifest.json: missing" in line and line.endswith("scenes/s --forcerun publish")
+    assert "results/s/publish/manifest.json: " in line and line.endswith("scenes/s --forcerun publish")
     shutil.rmtree(tmp_path / "results/s")
     (line,) = damaged(tmp_path)
-    assert "results/s: missing, although" in line and line.endswith("scenes/s --forcerun publish")
+    assert "results/s: " in line and line.endswith("scenes/s --forcerun publish")
 
 
 @pytest.mark.parametrize("finished", ["publish", "report"])
@@ -368,12 +365,12 @@ def test_what_was_published_must_be_there(tmp_path, finished):
     (tmp_path / "results/s/logs").mkdir()
     (tmp_path / "results/s/logs/publish.log").touch()
     (line,) = damaged(tmp_path)
-    assert "scenes/s: missing, although it was published; rebuild with: snakemake --cores 2 scenes/s" in line
+    assert "scenes/s: " in line and line.endswith("snakemake --cores 2 scenes/s --forcerun publish")
     assert list(damaged(tmp_path, ["other"])) == []
     (tmp_path / "scenes").mkdir()
     (tmp_path / "scenes/s").write_text("")
     (line,) = damaged(tmp_path)
-    assert line.endswith("scenes/s: a file where the folder of a scene belongs; move it away")
+    assert "scenes/s: " in line and "snakemake" not in line  # which would not help
 
 
 def test_a_page_that_was_asked_for_alone_is_not_missed_in_scenes(tmp_path):
@@ -387,7 +384,7 @@ def test_variants_of_a_study_share_stages(tmp_path):
     assert list(damaged(tmp_path)) == []
     shutil.rmtree(tmp_path / "results/room--s0")
     (line,) = damaged(tmp_path)
-    assert "results/room--s0/capture/manifest.json: missing, although" in line
+    named(line, "results/room--s0/capture/manifest.json")
 
 
 def replace_by_link(path, target):
@@ -481,12 +478,10 @@ def test_verify_does_not_take_one_variant_for_another(tmp_path):
     assert list(damaged(tmp_path)) == []
     shutil.rmtree(tmp_path / "results/room--v1/capture")
     (line,) = damaged(tmp_path)
-    assert line.startswith(
-        f"{tmp_path}/results/room--v1/capture/manifest.json: missing, although {tmp_path}/results/room--v1/base"
-    )
+    named(line, tmp_path / "results/room--v1/capture/manifest.json", tmp_path / "results/room--v1/base")
     shutil.rmtree(tmp_path / "results/room--v1/base")
     (line,) = damaged(tmp_path)
-    assert line.startswith(f"{tmp_path}/results/room--v1/base/manifest.json: missing, although {folder} was made from it")
+    named(line, tmp_path / "results/room--v1/base/manifest.json", folder)
     digest = sha256_of(tmp_path / "results/room--v2/base/manifest.json")
     manifests.write(folder / "manifest.json", document | {"manifests": {"base": digest}})
     assert list(damaged(tmp_path)) == []  # this one it shares
@@ -508,10 +503,9 @@ def test_verify_of_an_unknown_scene_is_one_error(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["workflow", "verify", "kichen"])
     assert main() == 1
-    assert capsys.readouterr().err == (
-        "error: kichen: neither results/kichen nor scenes/kichen holds anything to verify. Did you mean kitchen?"
-        " What is here: kitchen.\n"
-    )
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: kichen: ")
+    named(line, "results/kichen", "scenes/kichen", "kitchen")
     monkeypatch.setattr("sys.argv", ["workflow", "verify", "kitchen"])
     assert main() == 0
 
@@ -528,8 +522,7 @@ def test_scratch_keeps_many_arrays_in_few_mappings(tmp_path, monkeypatch):
     for before, after in zip(arrays, kept, strict=True):
         assert after.dtype == before.dtype and after.flags.aligned
         np.testing.assert_array_equal(before, after)
-    with pytest.raises(ValueError, match="read-only"):
-        kept[-1][0, 0] = 1
+    assert not kept[-1].flags.writeable
 
 
 def test_arrays_are_joined_on_disk(tmp_path):
@@ -539,15 +532,14 @@ def test_arrays_are_joined_on_disk(tmp_path):
     for part in parts:
         joined.add(part)
     for other in (parts[0].astype(np.float64), parts[0][:, :1]):
-        with pytest.raises(ValueError, match="cannot join"):
+        with refused(f"{other.dtype} {other.shape[1:]}", f"{parts[0].dtype} (2, 3)", kind=ValueError):
             joined.add(other)
     whole = joined.array()
     np.testing.assert_array_equal(whole, np.concatenate(parts))
     np.testing.assert_array_equal(whole[np.array([404, 3])], np.concatenate(parts)[[404, 3]])
     assert not list(tmp_path.iterdir())
-    with pytest.raises(ValueError, match="read-only"):
-        whole[0] = 1
-    with pytest.raises(ValueError, match="before they are read"):
+    assert not whole.flags.writeable
+    with refused("rows", kind=ValueError):
         joined.add(parts[0])
     none = scratch.Joined(tmp_path)
     none.add(parts[1])

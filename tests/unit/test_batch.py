@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from iif_core.errors import InputError
+from tests.errors import missing, named, refused
 from workflow import settings
 from workflow.artifacts import StageWriter, sound, stamps
 from workflow.artifacts.files import write_exr, write_json, write_parquet
@@ -88,40 +88,38 @@ def test_without_a_table_every_scene_file_counts(project, tmp_path):
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        (HEADER, ["no scene in it", "name <tab> source"]),
-        ("name source path\n", ["line 1", "one column", "tabs, not by spaces"]),
-        ("# x\nname\tsuorce\n", ["line 2", "column 2", "'suorce'", "Did you mean source?"]),
-        ("name\tpath\tpath\n", ["line 1", "column path stands twice"]),
-        ("path\tbase\n", ["line 1", "no column name"]),
+        (HEADER, ["name <tab> source <tab> path <tab> base <tab> overrides"]),
+        ("name source path\n", ["line 1", "'name source path'", "tabs", "spaces"]),
+        ("# x\nname\tsuorce\n", ["line 2", "column 2", "'suorce'", "name, source, path, base, overrides"]),
+        ("name\tpath\tpath\n", ["line 1", "column path"]),
+        ("path\tbase\n", ["line 1", "column name", "name, source, path, base, overrides"]),
         (HEADER + "a b folder\n", ["line 2, column name", "'a b folder'", "tabs", "spaces"]),
-        (HEADER + "a,folder,data/a\n", ["line 2, column name", "'a,folder,data/a'", "separated by tabs", "commas"]),
-        (HEADER + "a;folder;data/a\n", ["line 2, column name", "'a;folder;data/a'", "separated by tabs", "semicolons"]),
-        ("name,source\na,folder\n", ["line 1", "one column, 'name,source'", "separated by tabs, not by commas"]),
+        (HEADER + "a,folder,data/a\n", ["line 2, column name", "'a,folder,data/a'", "tabs", "commas"]),
+        (HEADER + "a;folder;data/a\n", ["line 2, column name", "'a;folder;data/a'", "tabs", "semicolons"]),
+        ("name,source\na,folder\n", ["line 1", "'name,source'", "tabs", "commas"]),
         (HEADER + "a\t\t\t\t\textra\n", ["line 2, column 6", "6 cells", "5 columns", "'extra'"]),
-        (HEADER + "\tfolder\n", ["line 2, column name", "empty"]),
-        (HEADER + "a/b\tfolder\n", ["line 2, column name", "'a/b'", "letters, digits"]),
-        (HEADER + "a--s0\tfolder\n", ["line 2, column name", "single -"]),
+        (HEADER + "\tfolder\n", ["line 2, column name"]),
+        (HEADER + "a/b\tfolder\n", ["line 2, column name", "'a/b'", "_", "-"]),
+        (HEADER + "a--s0\tfolder\n", ["line 2, column name", "'a--s0'", "-"]),
         (HEADER + "studies\tfolder\n", ["line 2, column name", "'studies'", "results/"]),
-        (HEADER + "a\n# c\na\tfolder\n", ["line 4, column name", "'a' stands in line 2 already"]),
-        (HEADER + "tpl\tfolder\n", ["line 2, column name", "config/scenes/tpl.yaml is there already", "column base"]),
-        (HEADER.encode("utf-16"), ["zero bytes", "UTF-8"]),
-        (HEADER.encode() + b"a\t\xff\n", ["line 2", "not UTF-8", "byte"]),
+        (HEADER + "a\n# c\na\tfolder\n", ["line 4, column name", "'a'", "line 2"]),
+        (HEADER + "tpl\tfolder\n", ["line 2, column name", "config/scenes/tpl.yaml", "column base"]),
+        (HEADER.encode("utf-16"), ["UTF-16", "UTF-8"]),
+        (HEADER.encode() + b"a\t\xff\n", ["line 2", "UTF-8", "byte 34"]),
     ],
 )
 def test_mistakes_about_which_scenes_there_are(project, table, words):
     project(table if isinstance(table, bytes) else table.encode())
-    with pytest.raises(InputError) as caught:
+    with refused(*words) as caught:
         batch_table.read_table()
     assert str(caught.value).startswith("config/batch.tsv")
-    for word in words:
-        assert word in str(caught.value)
 
 
 def test_all_mistakes_of_a_table_come_at_once(project):
     project("a b c\nok\ttpl\nd/e\n" + "".join(f"x{i}/\n" for i in range(30)))
-    with pytest.raises(InputError) as caught:
+    with refused("line 2", "'a b c'", "line 4", "'d/e'", 12) as caught:
         batch_table.read_table()
-    assert "line 2," in str(caught.value) and "line 4," in str(caught.value) and "... and 12 more" in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 32 - 12 + 1
 
 
 # ------------------------------------------------------------------------------------------------------------ overrides
@@ -132,10 +130,10 @@ def test_a_job_needs_its_own_line_alone(project):
     project("a\t\t\ttpl\tseed=9\nmy room\t\t\ttpl\nb\t\t\ttpl\nb\t\t\ttpl\tseed=8\n")
     assert settings.load("a").seed == 9
     assert settings.loading.scene_origin("a") == "config/batch.tsv, line 2"
-    with pytest.raises(InputError, match="line 5, column name: 'b' stands in line 4 already"):
+    with refused("line 5, column name", "'b'", "line 4"):
         settings.load("b")
     for ask in (batch_table.read_table, lambda: settings.load("c")):
-        with pytest.raises(InputError, match="line 3, column name: found 'my room'"):
+        with refused("line 3, column name", "'my room'"):
             ask()
 
 
@@ -155,21 +153,19 @@ def test_overrides_are_yaml_values_under_dotted_keys():
     ("text", "words"),
     [
         ("capture.views", ["'capture.views'", "key=value"]),
-        ("capture.views=", ["key=value"]),
-        ("capture..views=3", ["key=value", "dotted"]),
-        ("capture.views=3;capture.views=4", ["'capture.views' stands twice"]),
-        ("prior={kind: retinex};prior.samples=3", ["'prior' and 'prior.samples' set the same thing"]),
-        ("source.path=x", ["'source.path'", "its own column, path"]),
-        ("source.kind=folder", ["its own column, source"]),
-        ("seed=[1", ["'seed'", "not a YAML value"]),
+        ("capture.views=", ["'capture.views='", "key=value"]),
+        ("capture..views=3", ["'capture..views=3'", "key=value"]),
+        ("capture.views=3;capture.views=4", ["here: 'capture.views'"]),
+        ("prior={kind: retinex};prior.samples=3", ["'prior'", "'prior.samples'"]),
+        ("source.path=x", ["'source.path'", "path"]),
+        ("source.kind=folder", ["'source.kind'", "source"]),
+        ("seed=[1", ["'seed'", "'[1'", "YAML"]),
     ],
 )
 def test_mistakes_in_overrides(text, words):
-    with pytest.raises(InputError) as caught:
+    with refused(*words) as caught:
         batch_table.parse_overrides(text, "here")
     assert str(caught.value).startswith("here: ")
-    for word in words:
-        assert word in str(caught.value)
 
 
 # ------------------------------------------------------------------------------------------------------------ one scene
@@ -195,36 +191,34 @@ def test_a_base_may_lack_what_the_line_gives(project, tmp_path):
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("a\t\t\ttpl\tcapture.veiws=3", ["line 2, column overrides: `capture.veiws`: unknown key", "Did you mean `views`?"]),
-        ("a\t\t\ttpl\tcapture.views=0", ["line 2, column overrides: `capture.views`: found 0"]),
-        ("a\t\t\ttpl\tcapture=3", ["line 2, column overrides: `capture`: found 3"]),
-        ("a\tfoldr\tx\t\tprior.kind=retinex", ["line 2, column source: `source.kind`: found 'foldr', allowed: builtin"]),
-        ("a\tfolder\t\t\tprior.kind=retinex", ["line 2, column path: `source.path`: missing"]),
-        ("a\tfolder\tx\t\tprior.kind=retinx", ["column overrides: `prior.kind`: found 'retinx'", "Did you mean retinex?"]),
-        ("a\tbuiltin\tx\ttpl\tprior.kind=simulated", ["line 2, column path: `source.path`: unknown key. Kind `builtin`"]),
-        ("a\t\t\ttlp\t", ["line 2, column base: config/scenes/tlp.yaml not found", "Did you mean tpl?"]),
-        ("a\t\t\ttpl\tviews", ["line 2, column overrides: found 'views', needed key=value"]),
-        ("a\t\t\tbad\t", ["config/scenes/bad.yaml (base of config/batch.tsv, line 2): `seed`: found 'x'"]),
+        ("a\t\t\ttpl\tcapture.veiws=3", ["line 2, column overrides", "capture.veiws", "views"]),
+        ("a\t\t\ttpl\tcapture.views=0", ["line 2, column overrides", "capture.views", 0, 1]),
+        ("a\t\t\ttpl\tcapture=3", ["line 2, column overrides", "capture", 3, "key: value"]),
+        ("a\tfoldr\tx\t\tprior.kind=retinex", ["line 2, column source", "source.kind", "'foldr'", "builtin, mitsuba, folder"]),
+        ("a\tfolder\t\t\tprior.kind=retinex", ["line 2, column path", "source.path", "config/scenes/kitchen.yaml"]),
+        ("a\tfolder\tx\t\tprior.kind=retinx", ["line 2, column overrides", "prior.kind", "'retinx'", "retinex"]),
+        ("a\tbuiltin\tx\ttpl\tprior.kind=simulated", ["line 2, column path", "source.path", "builtin", "source.kind"]),
+        ("a\t\t\ttlp\t", ["line 2, column base", "config/scenes/tlp.yaml", "tpl"]),
+        ("a\t\t\ttpl\tviews", ["line 2, column overrides", "'views'", "key=value"]),
+        ("a\t\t\tbad\t", ["config/scenes/bad.yaml", "config/batch.tsv, line 2", "seed", "'x'"]),
     ],
 )
 def test_a_mistake_in_a_scene_names_line_column_and_key(project, tmp_path, line, words):
     (tmp_path / "config/scenes/bad.yaml").write_text(BASE.replace("seed: 4", "seed: x"))
     project(line + "\n")
-    with pytest.raises(InputError) as caught:
+    with refused(*words):
         settings.load("a")
-    for word in words:
-        assert word in str(caught.value)
 
 
 def test_an_unknown_scene_is_looked_for_in_the_table_too(project):
     project("office\t\tdata/a\ttpl\t\n")
-    with pytest.raises(InputError, match=r"Did you mean scenes/office\? Known scenes: tpl and 1 of config/batch.tsv"):
+    with refused("config/scenes/ofice.yaml", "scenes/office", "tpl and 1 of config/batch.tsv"):
         settings.load("ofice")
 
 
 def test_a_line_with_a_name_alone_is_not_told_to_be_itself(project):
     project("tpl2\n")
-    with pytest.raises(InputError, match=r"config/scenes/tpl2.yaml: not found. Did you mean scenes/tpl\? Known"):
+    with refused("config/scenes/tpl2.yaml", "scenes/tpl"):
         settings.load("tpl2")
 
 
@@ -245,9 +239,9 @@ def test_every_scene_is_refused_by_itself(project, monkeypatch):
     plan = batch_plan.plan("draft")
     assert list(plan.ready) == ["good"] and list(plan.refused) == ["key", "data", "gone", "disk"]
     assert "line 3, column overrides" in plan.refused["key"]
-    assert plan.refused["data"].startswith("config/batch.tsv, line 4: no/where: not found; `source.path` must be a folder")
-    assert "line 5: config/scenes/gone.yaml: not found" in plan.refused["gone"]
-    assert "line 6: ZeroDivisionError" in plan.refused["disk"] and "a bug" in plan.refused["disk"]
+    named(plan.refused["data"], "config/batch.tsv, line 4", "no/where", "source.path")
+    named(plan.refused["gone"], "line 5", "config/scenes/gone.yaml")
+    named(plan.refused["disk"], "line 6", "ZeroDivisionError")
     assert plan.ready["good"] == fp.fingerprint("publish", "good", "draft")
 
 
@@ -281,15 +275,15 @@ def test_what_lies_in_the_folders_of_a_scene_refuses_that_scene_alone(project):
     write_json(manifest, document | {"schema": EARLIER_SCHEMA})
     plan = batch_plan.plan("draft")
     assert list(plan.ready) == ["good"]
-    for name, words in {
-        "file": "scenes/file: a file, where the workflow makes a folder",
-        "stage": "results/stage/render: a file, where",
-        "logs": "results/logs/logs: a file, where",
-        "earlier": "python -m workflow upgrade earlier",
-        "name": "`overrides`: there is no object 'nosuchthing'",
-        "link": "scenes/link: a symbolic link",
+    for name, names in {
+        "file": ["scenes/file"],
+        "stage": ["results/stage/render"],
+        "logs": ["results/logs/logs"],
+        "earlier": ["python -m workflow upgrade earlier"],
+        "name": ["overrides", "'nosuchthing'"],
+        "link": ["scenes/link"],
     }.items():
-        assert words in plan.refused[name]
+        named(plan.refused[name], *names)
 
 
 def test_a_damaged_segmentation_is_made_again_whatever_overrides_name(project):
@@ -517,7 +511,7 @@ def test_a_part_of_the_prior_that_failed_is_the_reason(five):
 
 
 def test_only_a_finished_plan_counts_as_complete(five, monkeypatch):
-    with pytest.raises(InputError, match="failed and 2 more: not done, although all jobs ended well"):
+    with refused("failed", 2):
         summary.write_summary("draft", "mark")
     assert not Path("results/batch/complete").exists() and Path("results/batch/report.html").is_file()
     lines = tuple(line for line in five.lines if line.name in ("done", "refused"))
@@ -528,7 +522,8 @@ def test_only_a_finished_plan_counts_as_complete(five, monkeypatch):
     page, table = Path("results/batch/report.html"), Path("results/batch/summary.tsv")
     page.write_text("")
     table.unlink()
-    assert batch_plan.faults_of_the_summary() == (f"{table}: missing", f"{page}: its content changed since it was written")
+    faults = batch_plan.faults_of_the_summary()
+    assert [fault.split(": ")[0] for fault in faults] == [str(table), str(page)]
     summary.write_summary("draft")
     assert not Path("results/batch/complete").exists() and batch_plan.faults_of_the_summary() == ()
 
@@ -542,7 +537,7 @@ def test_a_scene_whose_results_were_removed_is_done(five):
 
 
 def test_refusing_names_every_scene(five):
-    with pytest.raises(InputError, match=r"(?s)1 of the batch cannot be run:.*line 3: .*second line"):
+    with refused("config/batch.tsv, line 3", "<script>bad\\tdata</script>\nsecond line"):
         summary.refuse("draft")
 
 
@@ -679,5 +674,5 @@ def test_an_unknown_quality_is_refused_and_the_summary_stays(project, repository
             capture_output=True,
             text=True,
         )
-        assert said.returncode == 1 and "unknown quality. Did you mean standard?" in said.stderr and not said.stdout
+        assert said.returncode == 1 and not missing(said.stderr, "standrad", "standard") and not said.stdout
     assert kept.read_text() == "as it was" and [path.name for path in kept.parent.iterdir()] == ["summary.tsv"]

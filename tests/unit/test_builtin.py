@@ -11,8 +11,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from iif_core.camera.pinhole import look_at
-from iif_core.errors import InputError
 from iif_core.numerics.xp import NUMPY
+from tests.errors import refused
 from workflow.sources import rooms
 from workflow.sources.rooms import patterns, shapes
 from workflow.sources.rooms.coverage import seen_from, surface_points
@@ -109,7 +109,7 @@ def test_tube_around_three_corners_keeps_its_radius():
 
 
 def test_impossible_box_is_refused():
-    with pytest.raises(ValueError, match="no volume"):
+    with refused("[0. 0. 0.]", "[ 1. -1.  1.]", kind=ValueError):
         shapes.box((0, 0, 0), (1, -1, 1))
 
 
@@ -240,7 +240,7 @@ def test_kitchen_cameras_stand_where_a_person_would(kitchen):
 
 def test_too_many_cameras_are_refused():
     room = rooms.build("tiny")
-    with pytest.raises(InputError, match="capture.views"):
+    with refused("capture.views", 9, "tiny"):
         # a room whose every corner is taken
         type(room)(**{**vars(room), "parts": np.array([[[0.0, 0, 0], [3, 3, 3]]])}).cameras(9)
 
@@ -333,7 +333,7 @@ def test_every_kind_of_pattern_shows_its_colours():
 
 
 def test_unknown_kind_is_refused():
-    with pytest.raises(ValueError, match="houndstooth"):
+    with refused("'houndstooth'", "plain", "rug", kind=ValueError):
         MaterialTable((Material((1, 1, 1), kind="houndstooth"),))
 
 
@@ -501,7 +501,7 @@ def test_hdr_photographs_are_radiance(llvm, tmp_path, monkeypatch):
 
 
 def test_unknown_room_is_refused():
-    with pytest.raises(InputError, match="'cellar'.*kitchen, matte, tiny"):
+    with refused("source.scene", "'cellar'", "kitchen, matte, tiny"):
         rooms.build("cellar")
 
 

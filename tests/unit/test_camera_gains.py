@@ -9,7 +9,7 @@ from iif_core.camera.calibration.choice import calibrate_response
 from iif_core.camera.gains import CameraGains, GainRows, choose_gains, estimate, falloff, radius_squared, with_held_out_views
 from iif_core.camera.overlap import PatchRows
 from iif_core.camera.response import response
-from iif_core.errors import InputError
+from tests.errors import refused
 
 VIEWS = 10
 VIGNETTING = np.array([-0.35, -0.12])
@@ -97,7 +97,7 @@ def test_views_without_overlap_keep_one():
     out = choose_gains(alone, VIEWS)
     np.testing.assert_array_equal(out.gain, 1.0)
     assert not out.estimated.any() and not out.evidence["vignetting"].included
-    with pytest.raises(InputError, match="out of range"):
+    with refused("gains", "0..9", "0..2"):
         estimate(rows, 3)
 
 

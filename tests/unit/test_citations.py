@@ -12,14 +12,13 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 EQUATION = re.compile(r"\bEqs?\. ([A-Z])\.(\d+[a-z]?)(?:(?:, | and | to |-)(?:([A-Z])\.)?(\d+[a-z]?))*")
 NUMBER = re.compile(r"\b([A-Z])\.(\d+[a-z]?)\b")
-PAGE = re.compile(r"(?<![\w/.-])(?:docs|lab/notebook)/[\w/-]+\.md(?:#[\w-]+)?")
+PAGE = re.compile(r"(?<![\w/.-])(?:docs|lab/notebook|lab/docs)/[\w/-]+\.md(?:#[\w-]+)?")
 LINK = re.compile(r"(?<!!)\[[^\]]*\]\(([^)\s]+)\)|!\[[^\]]*\]\(([^)\s]+)\)")
 UNSHIPPED = re.compile(r"\b[A-Z]{6,} (?:\d+\.\d+|H\d+)\b|\bH\d{1,2}\b")  # sections of papers in capitals, numbered hazards
 PAGE_OF_LETTER = {
     "R": "reflectance",
     "C": "camera",
     "P": "priors",
-    "T": "../development/published",
     "N": "plan",
     "O": "objects",
     "F": "fusion",
@@ -64,13 +63,18 @@ def anchors(page: Path) -> frozenset[str]:
     return frozenset(found)
 
 
+def pages_of(letter: str) -> list[Path]:
+    """Pages with equations of a letter: one of the method, and pages of the laboratory that continue it."""
+    page = ROOT / "docs/method" / f"{PAGE_OF_LETTER.get(letter, '')}.md"
+    return [path for path in [page, *sorted((ROOT / "lab/docs").glob("*.md"))] if path.is_file()]
+
+
 def missing_equations(text: str) -> list[str]:
-    """Equations that a text cites and docs/method does not have."""
+    """Equations that a text cites and no page has."""
     out = []
     for citation in EQUATION.finditer(text):
         for letter, number in NUMBER.findall(citation[0]):
-            page = ROOT / "docs/method" / f"{PAGE_OF_LETTER.get(letter, '')}.md"
-            if not page.is_file() or f"eq-{letter.lower()}{number}" not in anchors(page):
+            if not any(f"eq-{letter.lower()}{number}" in anchors(page) for page in pages_of(letter)):
                 out.append(f"Eq. {letter}.{number}")
     return out
 
@@ -126,12 +130,17 @@ def test_nothing_cites_what_does_not_ship():
 
 
 def test_every_equation_is_numbered_once_and_in_order():
-    for letter, name in PAGE_OF_LETTER.items():
-        text = (ROOT / "docs/method" / f"{name}.md").read_text()
-        ids = [int(number) for number in re.findall(rf'<a id="eq-{letter.lower()}(\d+)"', text)]
-        tags = [int(number) for number in re.findall(rf"\\tag\{{{letter}\.(\d+)\}}", text)]
-        assert ids == tags == list(range(1, len(ids) + 1)), name
-        assert ids, name
+    """The numbers of a letter run without a gap over its page and the pages of the laboratory, in order on each."""
+    for letter in [*PAGE_OF_LETTER, "T"]:
+        numbers = []
+        for page in pages_of(letter):
+            text = page.read_text()
+            ids = [int(number) for number in re.findall(rf'<a id="eq-{letter.lower()}(\d+)"', text)]
+            tags = [int(number) for number in re.findall(rf"\\tag\{{{letter}\.(\d+)\}}", text)]
+            assert ids == tags == sorted(ids), (letter, page)
+            numbers += ids
+        assert sorted(numbers) == list(range(1, len(numbers) + 1)), letter
+        assert numbers, letter
 
 
 def test_the_finders_find():

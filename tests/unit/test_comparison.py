@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from iif_core.errors import InputError
 from iif_core.numerics.color import srgb_from_linear
 from lab.studies.grid import Line, draw
+from tests.errors import refused
 from workflow.artifacts.files import write_exr
 from workflow.artifacts.store import split_rgb
 from workflow.comparison import maps as foreign
@@ -61,18 +61,17 @@ def test_roughness_is_never_decoded(folder):
 @pytest.mark.parametrize(
     ("quantity", "name", "array", "words"),
     [
-        ("albedo", "00.exr", colour(), "the scene has no view 00. Did you mean 001?"),
-        ("albedo", "000.tiff", None, "maps are .exr or .png"),
-        ("albedo", "000.exr", colour(shape=(8, 6)), "6 x 8 pixels; view 000 has 6 x 4"),
-        ("albedo", "000.exr", colour(-0.5), "72 values are negative, the least -0.5"),
-        ("emission", "000.png", colour(), "radiance does not fit into a PNG"),
+        ("albedo", "00.exr", colour(), ["view 00", "000, 001"]),
+        ("albedo", "000.tiff", None, [".tiff", ".exr or .png"]),
+        ("albedo", "000.exr", colour(shape=(8, 6)), ["6 x 8", "view 000", "6 x 4"]),
+        ("albedo", "000.exr", colour(-0.5), [72, "-0.5", 0]),
+        ("emission", "000.png", colour(), ["PNG", "EXR"]),
     ],
 )
 def test_bad_maps_are_refused_by_name(folder, quantity, name, array, words):
     where = folder(quantity, name, array if array is not None else colour())
-    with pytest.raises(InputError, match="(?s)" + words.replace("?", r"\?")) as refused:
+    with refused(f"{quantity}/{name}", *words):
         foreign.read_map(foreign.find(where, "auto", VIEWS), quantity, VIEW)
-    assert name in str(refused.value)
 
 
 def test_values_that_are_no_numbers_are_refused(folder, tmp_path):
@@ -82,20 +81,20 @@ def test_values_that_are_no_numbers_are_refused(folder, tmp_path):
     broken = np.full((4, 6), np.nan, np.float32)
     with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, {"Y": broken}) as file:
         file.write(str(where / "roughness/000.exr"))
-    with pytest.raises(InputError, match="000.exr: 24 values are NaN or infinite"):
+    with refused("roughness/000.exr", 24, "NaN"):
         foreign.read_map(foreign.find(where, "auto", VIEWS), "roughness", VIEW)
 
 
 def test_folders_without_maps_and_unknown_words_are_refused(folder, tmp_path):
-    with pytest.raises(InputError, match="no such folder of maps; needed: albedo/<view>.exr"):
+    with refused(tmp_path / "nothing", "albedo/<view>.exr"):
         foreign.find(tmp_path / "nothing", "auto", VIEWS)
-    with pytest.raises(InputError, match="no maps; needed"):
+    with refused(f"{tmp_path}: ", "albedo/<view>.exr"):
         foreign.find(tmp_path, "auto", VIEWS)
     folder("albedo", "000.exr", colour())
-    with pytest.raises(InputError, match="colour=rec709: allowed are auto, srgb, linear"):
+    with refused("colour=rec709", "auto, srgb, linear"):
         foreign.find(tmp_path, "rec709", VIEWS)
     folder("albedo", "000.png", colour())
-    with pytest.raises(InputError, match="000.exr is there, too"):
+    with refused("albedo/000.png", "000.exr"):
         foreign.find(tmp_path, "auto", VIEWS)
 
 

@@ -15,6 +15,7 @@ from iif_core.light.emission.gains import (
 )
 from iif_core.light.emission.pruning import WhiteSurface, insignificant, prune_groups
 from iif_core.light.emission.rows import EmissionRows, block_rows
+from tests.errors import refused
 from tests.unit.emission_systems import rows_of
 
 TRUE = np.array([5.0, 10.0, 20.0])[:, None] * np.array([1.0, 0.8, 0.5])
@@ -192,9 +193,9 @@ def test_refused(initial):
 def test_non_finite_rows_are_refused():
     a, y = _random(10)
     y[3, 1] = np.nan
-    with pytest.raises(InputError, match="observed"):
+    with refused("emission rows", "observed"):
         solve_emission(_rows(a, a, y), np.ones((3, 3)))
-    with pytest.raises(InputError, match="weight"):
+    with refused("emission rows", "weight", "(3,)", "(10, 3)"):
         EmissionRows(np.stack([a, a])[:, None], y, np.zeros((2, 1, 10, 3)), np.ones(3), np.zeros((10, 3), bool))
 
 

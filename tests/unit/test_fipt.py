@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
+from tests.errors import named
 from tests.unit import own_scene as own
 from workflow import settings
 from workflow.sources import fipt
@@ -176,7 +177,7 @@ def test_real(tmp_path):
 def test_truth_is_all_or_none(tmp_path):
     synthetic(tmp_path)
     (tmp_path / "val/Metallic/001_0001.exr").unlink()
-    assert "Metallic/001_0001.exr: not found (1 truth maps are missing)" in refused(tmp_path)
+    named(refused(tmp_path), "val/Metallic/001_0001.exr", 1)
     (tmp_path / "val/BaseCol").rename(tmp_path / "val/DiffCol")
     found = fipt.find_inputs(*(document(tmp_path)[key] for key in ("source", "capture")))
     assert not found.truth and any("no ground truth: BaseCol missing" in note for note in found.transforms.notes)
@@ -185,44 +186,48 @@ def test_truth_is_all_or_none(tmp_path):
 def test_synthetic_refusals(tmp_path):
     synthetic(tmp_path)
     np.save(tmp_path / "train/Image/cam/exposure.npy", np.array([1.0, 0.0, 1.0]))
-    assert "3 exposures (smallest 0); expected 3 positive numbers" in refused(tmp_path, "ldr")
+    named(refused(tmp_path, "ldr"), "cam/exposure.npy", 3, 0)
     np.save(tmp_path / "train/Image/cam/exposure.npy", np.ones(3))
     np.save(tmp_path / "train/Image/cam/crf.npy", np.ones((1024, 3)))
-    assert "shape (1024, 3); expected (3, n)" in refused(tmp_path, "ldr")
+    named(refused(tmp_path, "ldr"), "cam/crf.npy", "(1024, 3)", "(3, n)")
     (tmp_path / "train/Image/cam/crf.npy").write_bytes(b"nothing")
-    assert "crf.npy: not a readable array" in refused(tmp_path, "ldr")
+    named(refused(tmp_path, "ldr"), "cam/crf.npy", "np.save")
     (tmp_path / "train/IndexMA/001_0001.exr").unlink()
-    assert "IndexMA/001_0001.exr: not found (1 id maps are missing)" in refused(tmp_path)
-    assert "segmentation: not found; `source.ids` is semantic" in refused(tmp_path, ids="semantic")
+    named(refused(tmp_path), "IndexMA/001_0001.exr", 1, "source: {ids: none}")
+    named(refused(tmp_path, ids="semantic"), "train/segmentation", "source.ids", "semantic")
     path = tmp_path / "train/transforms.json"
     stated = json.loads(path.read_text())
     path.write_text(json.dumps({"frames": stated["frames"]}))
-    assert "no `camera_angle_x`" in refused(tmp_path)
+    named(refused(tmp_path), "train/transforms.json", "camera_angle_x")
     path.write_text(json.dumps(stated | {"frames": [{}, *stated["frames"][1:]]}))
-    assert "camera 0 (train/Image/000_0001.exr): `transform_matrix` missing" in refused(tmp_path)
+    named(refused(tmp_path), "train/transforms.json", "camera 0", "train/Image/000_0001.exr", "transform_matrix")
     (tmp_path / "train/Image/000_0001.exr").unlink()
-    assert "1 image(s) not found" in refused(tmp_path)
+    named(refused(tmp_path), "train/transforms.json", 1, tmp_path / "train/Image/000_0001.exr")
     path.unlink()
-    assert "neither train/transforms.json (synthetic) nor cam.txt" in refused(tmp_path)
+    named(refused(tmp_path), "train/transforms.json", "cam.txt", "K_list.txt", "source.path")
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "words"),
+    ("name", "change", "names"),
     [
-        ("cam.txt", lambda t: t.replace("3\n", "4\n", 1), "27 numbers for 4 cameras; expected 9"),
-        ("cam.txt", lambda t: "three\n" + t, "expected the number of cameras"),
-        ("K_list.txt", lambda t: "1\n60 0 33\n0 62 23\n0 0 1\n", "1 cameras, cam.txt has 3"),
-        ("K_list.txt", lambda t: t.replace("60.0 0.0 33.0", "60.0 5.0 33.0"), "expected fx 0 cx / 0 fy cy / 0 0 1"),
-        ("K_list.txt", None, "a real FIPT scene needs cam.txt and K_list.txt"),
+        ("cam.txt", lambda t: t.replace("3\n", "4\n", 1), [27, 4, 9]),
+        ("cam.txt", lambda t: "three\n" + t, ["'three'"]),
+        ("K_list.txt", lambda t: "1\n60 0 33\n0 62 23\n0 0 1\n", [1, "cam.txt", 3]),
+        (
+            "K_list.txt",
+            lambda t: t.replace("60.0 0.0 33.0", "60.0 5.0 33.0"),
+            ["camera 0", "60.0, 5.0, 33.0"],
+        ),
+        ("K_list.txt", None, ["cam.txt", "FIPT"]),
     ],
 )
-def test_real_refusals(tmp_path, name, change, words):
+def test_real_refusals(tmp_path, name, change, names):
     real(tmp_path)
     if change is None:
         (tmp_path / name).unlink()
     else:
         (tmp_path / name).write_text(change((tmp_path / name).read_text()))
-    assert words in refused(tmp_path)
+    named(refused(tmp_path), tmp_path / name, *names)
 
 
 def test_up_that_is_not_square_is_refused(tmp_path):
@@ -230,4 +235,4 @@ def test_up_that_is_not_square_is_refused(tmp_path):
     lines = (tmp_path / "cam.txt").read_text().splitlines()
     lines[2], lines[3] = lines[3], lines[2]  # up and look-at exchanged
     (tmp_path / "cam.txt").write_text("\n".join(lines))
-    assert "viewing direction and up vector are not square" in refused(tmp_path)
+    named(refused(tmp_path), "cam.txt", "camera 0", "-0.9776", "0.002")

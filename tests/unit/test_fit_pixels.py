@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from iif_core.errors import InputError
+from tests.errors import refused
 from workflow.artifacts.files import read_parquet, write_parquet
 from workflow.fitting.fit_pixels import FitPixels, count_eligible
 from workflow.scene.base_scene import ViewPixels
@@ -46,11 +46,11 @@ def test_light_is_found_by_pixel_and_its_absence_is_named():
     light = SpecularLight(np.array([3, 8, 40]), rng.random((2, 3, 4, 3)), rng.random((2, 3, 4, 3)))
     some = light.at(np.array([40, 3]))
     np.testing.assert_array_equal(some.s0, light.s0[:, [2, 0]])
-    with pytest.raises(InputError, match=r"shading: \{pixels: all\}"):
+    with refused("shading.pixels", "shading: {pixels: all}"):
         light.at(np.array([8, 9]))
     none = SpecularLight(np.zeros(0, np.int64), np.zeros((2, 0, 4, 3)), np.zeros((2, 0, 4, 3)))
     assert none.at(np.zeros(0, np.int64)).s1.shape == (2, 0, 4, 3)
-    with pytest.raises(InputError, match="fewer pixels"):
+    with refused("shading.pixels", "shading: {pixels: all}"):
         none.at(np.array([1]))
 
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iif_core.errors import InputError
 from iif_core.fusion.direct import solve_direct
 from iif_core.fusion.options import FusionOptions
 from iif_core.fusion.pixels import surface_tangents
 from iif_core.fusion.problem import LOWEST, FusionProblem
 from iif_core.fusion.selection import selection_weights
 from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
+from tests.errors import refused
 from tests.unit.test_fusion_direct import simulated
 from workflow.artifacts.scratch import Scratch
 
@@ -101,7 +101,7 @@ def test_ids_above_sixteen_bits():
     )
     np.testing.assert_array_equal(moved.value, result.value)
     np.testing.assert_array_equal(moved.object_value[shift:], result.object_value)
-    with pytest.raises(InputError, match="object ids span"):
+    with refused("object ids", "70000 ... 70000", "-1 ... 65534"):
         pack_keys(np.ones((1, 3)), 70_000)  # the cell grid has 16 bits for objects: refused, never wrapped
 
 
@@ -174,5 +174,5 @@ def test_units_of_the_weights_do_not_matter(factor):
 def test_integer_maps_are_refused():
     problem, _ = simulated()
     maps = [(255 * p).astype(np.uint8) for p in problem.predictions]
-    with pytest.raises(InputError, match="uint8; half or float"):
+    with refused("view 0", "uint8"):
         solve_direct(replace(problem, predictions=maps))

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from iif_core.errors import InputError
 from iif_core.light import irradiance
 from iif_core.light.irradiance import SurfaceCellsBuilder, estimate_log_light, fit_light, gather, residual_light
+from tests.errors import refused
 
 EDGE = 0.125
 N = 8
@@ -163,5 +163,5 @@ def test_same_bytes_twice_and_nothing_from_nothing():
     cells = cells_of(points, normals, wall, np.random.default_rng(1).random((len(points), 3)), np.zeros(len(points), bool))
     first, second = (estimate_log_light(cells, gather(cells, trace_cube, 3), 0.4, (3.0,)) for _ in range(2))
     np.testing.assert_array_equal(first, second)
-    with pytest.raises(InputError, match="edge"):
+    with refused("edge", "0.0"):
         SurfaceCellsBuilder(points, 0.0)

@@ -12,6 +12,7 @@ import trimesh
 from PIL import Image
 
 from iif_core.errors import InputError
+from tests.errors import missing, refused
 from tests.unit import own_scene as own
 from tests.unit.test_mitsuba_source import ROOM, write
 from workflow.artifacts.files import inside
@@ -30,18 +31,17 @@ from workflow.sources.folder_scene import images, mesh, transforms
 BAD_NAMES = ("", " ", ".", "..", ".x", "a/b", "a\\b", "a\0b", "a\nb", "a\x1b[31m", "\u202egpj", "\ud800", "x" * (LONGEST + 1))
 
 
-def refused(action, words):
-    with pytest.raises(InputError, match=words) as caught:
+def refuses(action, *names):
+    with refused(*names) as caught:
         action()
     assert str(caught.value).replace("\n", "").isprintable()
-    return str(caught.value)
 
 
 @pytest.mark.parametrize("name", BAD_NAMES)
 def test_names_that_become_no_files(tmp_path, name):
     assert fault_of_name(name)
     if name not in ("a/b", "x" * (LONGEST + 1)):  # a folder and a file; and longer than the name of a view, but not of a file
-        with pytest.raises(InputError, match="neither read nor written"):
+        with refused(repr(name)):
             inside(tmp_path, name)
 
 
@@ -73,30 +73,30 @@ def test_a_message_does_not_steer_a_terminal():
 
 
 @pytest.mark.parametrize(
-    ("data", "words"),
+    ("data", "names"),
     [
-        (b"", "not valid JSON"),
-        ("{}".encode("utf-16"), "not UTF-8"),
-        (b"\xff{}", "not UTF-8"),
-        (b"[" * 100_000, "nested too deeply"),
-        (b'{"a": 1, "a": 2}', "'a' stands twice"),
-        (b"[" + b"9" * 400 + b"]", "an integer of 400 digits"),
+        (b"", ["JSON"]),
+        ("{}".encode("utf-16"), ["UTF-16", "UTF-8"]),
+        (b"\xff{}", ["byte 0", "UTF-8"]),
+        (b"[" * 100_000, ["JSON"]),
+        (b'{"a": 1, "a": 2}', ["'a'"]),
+        (b"[" + b"9" * 400 + b"]", [400]),
     ],
 )
-def test_documents(tmp_path, data, words):
+def test_documents(tmp_path, data, names):
     (tmp_path / "x.json").write_bytes(data)
-    refused(lambda: read_json(tmp_path / "x.json"), words)
+    refuses(lambda: read_json(tmp_path / "x.json"), tmp_path / "x.json", *names)
 
 
 def test_files_that_are_none(tmp_path):
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "large").write_bytes(bytes(10))
-    refused(lambda: read_text(tmp_path / "folder"), "is a folder")
-    refused(lambda: read_text(tmp_path / "pipe"), "no ordinary file")
-    refused(lambda: read_text(tmp_path / "nowhere"), "not found")
-    refused(lambda: read_text(tmp_path / "large", 9), "10 bytes; a text file may have 9")
-    refused(lambda: read_text(tmp_path / ("x" * 300)), "cannot be read|not found")
+    refuses(lambda: read_text(tmp_path / "folder"), tmp_path / "folder")
+    refuses(lambda: read_text(tmp_path / "pipe"), tmp_path / "pipe")
+    refuses(lambda: read_text(tmp_path / "nowhere"), tmp_path / "nowhere")
+    refuses(lambda: read_text(tmp_path / "large", 9), tmp_path / "large", 10, 9)
+    refuses(lambda: read_text(tmp_path / ("x" * 300)), tmp_path / ("x" * 300))
     assert parse_json(tmp_path, "[1, NaN]")[0] == 1
 
 
@@ -106,7 +106,7 @@ def test_whatever_a_parser_throws_is_one_message(tmp_path, error):
         with reading(tmp_path, "cannot be read"):
             raise error
 
-    refused(fail, "cannot be read")
+    refuses(fail, tmp_path)
 
 
 @pytest.mark.parametrize("text", ["[" * 900_000, "- " * 400_000 + "x", "{a: " * 100_000])
@@ -115,28 +115,28 @@ def test_deep_settings_do_not_kill_the_process(tmp_path, text):
     (tmp_path / "x.yaml").write_text(text)
     code = "import sys, pathlib\nfrom workflow.settings.yaml_file import read_yaml\nread_yaml(pathlib.Path(sys.argv[1]))"
     run = subprocess.run([sys.executable, "-c", code, tmp_path / "x.yaml"], capture_output=True, text=True)
-    assert run.returncode == 1 and "nested more than 32 levels deep" in run.stderr
+    assert run.returncode == 1 and not missing(run.stderr, "x.yaml", 32)
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "names"),
     [
-        ("x: &x [*x]", "an anchor that holds itself"),
-        ("\n".join(f"k{i}: 1" for i in range(40_000)), "more than 20000 keys"),
-        ("a: 2026-02-30", "a value of the wrong form"),
-        ("a: 1e308", "allowed are numbers up to"),
-        ("a: .nan", "allowed are numbers up to"),
-        (f"a: {'9' * 400}", "a number of 400 characters"),
-        (f"a: {'x' * 5000}", "a text of 5000 characters"),
-        ('a: "\\0"', "a text with a zero byte"),
-        ("? [a]\n: 1", "key is no text|unhashable"),
-        ("a: 1\na: 2", "stands twice"),
-        ("a: !!python/object/apply:os.system [true]", "could not determine a constructor"),
+        ("x: &x [*x]", ["line 1", "anchor"]),
+        ("\n".join(f"k{i}: 1" for i in range(40_000)), ["line 1", 20000]),
+        ("a: 2026-02-30", ["YAML"]),
+        ("a: 1e308", ["line 1", "1e308", "1e+12"]),
+        ("a: .nan", ["nan", "1e+12"]),
+        (f"a: {'9' * 400}", ["line 1", 400, 40]),
+        (f"a: {'x' * 5000}", ["line 1", 5000, 4096]),
+        ('a: "\\0"', ["line 1", "byte"]),
+        ("? [a]\n: 1", ["line 1", "key"]),
+        ("a: 1\na: 2", ["line 2", "`a`"]),
+        ("a: !!python/object/apply:os.system [true]", ["line 1", "python/object/apply:os.system"]),
     ],
 )
-def test_settings(tmp_path, text, words):
+def test_settings(tmp_path, text, names):
     (tmp_path / "x.yaml").write_text(text)
-    refused(lambda: read_yaml(tmp_path / "x.yaml"), words)
+    refuses(lambda: read_yaml(tmp_path / "x.yaml"), tmp_path / "x.yaml", *names)
 
 
 @pytest.mark.parametrize("path", ["x" * 300, "/", "/dev/zero", "x/" * 1500, "a\0b"])
@@ -144,14 +144,14 @@ def test_paths_of_settings_that_no_disk_has(tmp_path, path):
     tree = own.settings_of(tmp_path, {"path": path})
     for document in (tree, {**tree, "affines": {**tree["affines"], "response": {"file": path}}}):
         stage = "capture" if document is tree else "emission"
-        refused(lambda document=document, stage=stage: raw_inputs(stage, document), ": ")
+        refuses(lambda document=document, stage=stage: raw_inputs(stage, document))
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="nothing is unreadable for root")
 def test_unreadable_files(tmp_path):
     own.bare(tmp_path)
     (tmp_path / "transforms.json").chmod(0)
-    refused(lambda: raw_inputs("capture", own.settings_of(tmp_path)), "Permission denied")
+    refuses(lambda: raw_inputs("capture", own.settings_of(tmp_path)), "transforms.json", "Permission denied")
 
 
 # ------------------------------------------------------------------------------------------------- pictures, arrays, meshes
@@ -160,7 +160,7 @@ def test_unreadable_files(tmp_path):
 @pytest.mark.parametrize("start", [b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", b"GIF89a\x01\0\x01\0\0\0\0"])
 def test_only_the_readers_of_photographs_are_open(tmp_path, start):
     (tmp_path / "x.png").write_bytes(start)
-    refused(lambda: images.header(tmp_path / "x.png"), "not a readable image")
+    refuses(lambda: images.header(tmp_path / "x.png"), tmp_path / "x.png", "PNG, JPEG")
 
 
 def test_photographs_convert_in_strips(tmp_path, monkeypatch):
@@ -183,9 +183,9 @@ def test_arrays(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((3, 4)))
     data = (tmp_path / "a.npy").read_bytes()
     (tmp_path / "l.npy").write_bytes(data.replace(b"(3, 4), }          ", b"(3, 4000000000), } "))
-    refused(lambda: read_npy(tmp_path / "z.npy"), "an .npz archive")
-    refused(lambda: read_npy(tmp_path / "o.npy"), "expected numbers")
-    assert "4000000000" in refused(lambda: read_npy(tmp_path / "l.npy"), "cut short")
+    refuses(lambda: read_npy(tmp_path / "z.npy"), "z.npy", ".npz", "np.save")
+    refuses(lambda: read_npy(tmp_path / "o.npy"), "o.npy", "object")
+    refuses(lambda: read_npy(tmp_path / "l.npy"), "l.npy", len(data), "(3, 4000000000)")
     assert read_npy(tmp_path / "a.npy").shape == (3, 4)
 
 
@@ -196,11 +196,11 @@ def test_response_tables_with_lists_or_too_many_rows(tmp_path, monkeypatch):
     x = np.linspace(0, 1, 9)
     table = {"x": x, "R": [[v, v] for v in x], "G": x, "B": x}
     pyarrow.parquet.write_table(pyarrow.table(table), tmp_path / "r.parquet")
-    refused(lambda: read_response_file(tmp_path / "r.parquet"), "column R holds lists")
+    refuses(lambda: read_response_file(tmp_path / "r.parquet"), "r.parquet", "column R")
     pyarrow.parquet.write_table(pyarrow.table({**table, "R": x}), tmp_path / "r.parquet")
     read_response_file(tmp_path / "r.parquet")
     monkeypatch.setattr(limits, "TABLE_ROWS", 8)
-    refused(lambda: read_response_file(tmp_path / "r.parquet"), "9 rows")
+    refuses(lambda: read_response_file(tmp_path / "r.parquet"), "r.parquet", 9)
 
 
 @pytest.mark.parametrize("line", ["4 0 1 2 3", "255 0 1 2", "3 0 1 99", "3 -1 0 1", "0"])
@@ -241,13 +241,13 @@ def test_glb_that_announces_more_than_it_holds(tmp_path):
     data = bytearray(glb(tmp_path / "d.glb", lambda document: None).read_bytes())
     struct.pack_into("<I", data, 20 + struct.unpack_from("<I", data, 12)[0], 1 << 31)  # the length of the second part
     (tmp_path / "d.glb").write_bytes(data)
-    refused(lambda: load_insert(tmp_path / "d.glb"), "one of its parts has 2147483648 bytes")
-    refused(lambda: load_insert(glb(tmp_path / "a.glb", endless)), "accessor 0 announces 1000000000 entries")
+    refuses(lambda: load_insert(tmp_path / "d.glb"), "d.glb", 2147483648)
+    refuses(lambda: load_insert(glb(tmp_path / "a.glb", endless)), "a.glb", "accessor 0", 1000000000)
     load_insert(glb(tmp_path / "b.glb", lambda document: None))
     glb(tmp_path / "c.glb", repeated)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(limits, "INSERT_FACES", 10_000)
-        refused(lambda: load_insert(tmp_path / "c.glb"), "faces with all that its nodes repeat")
+        refuses(lambda: load_insert(tmp_path / "c.glb"), "c.glb", "nodes")
 
 
 def test_colmap_counts(tmp_path):
@@ -312,7 +312,7 @@ def test_two_pictures_in_one_file_of_a_telephone_are_a_photograph(tmp_path):
 def test_a_picture_of_another_format_than_it_says_is_named(tmp_path):
     path = tmp_path / "t.jpg"
     path.write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
-    with pytest.raises(InputError, match=r"t\.jpg: not a readable image .its content is none of PNG, JPEG,"), opened(path):
+    with refused("t.jpg", "PNG, JPEG"), opened(path):
         pass
 
 
@@ -322,4 +322,4 @@ def test_textures_of_scenes_have_a_limit(tmp_path, monkeypatch):
     tree = {"source": {"path": str(tmp_path / "scene.xml")}}
     assert len(mitsuba.raw_inputs(tree)) == 2
     monkeypatch.setattr(limits, "PICTURE_PIXELS", 99)
-    refused(lambda: mitsuba.raw_inputs(tree), "t.png: 10x10 pixels")
+    refuses(lambda: mitsuba.raw_inputs(tree), "t.png", "10x10")

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from iif_core.errors import InputError
 from iif_core.light.light_maps import HALF_TOP, group_lamps, recombine, smooth, to_half, with_mean_of
+from tests.errors import refused
 from tests.unit.test_transport import polygon_irradiance
 from tests.unit.transport_rooms import assert_mean, box, lambertian, merge, quad, repeated
 
@@ -174,7 +175,7 @@ def test_known_light_is_asked_by_side_object_and_distance(T):
 
 def test_lamps_out_of_range_are_named(T, room, light_maps):
     scene = T.Scene(room.geometry, room.material, room.emitters)
-    with pytest.raises(InputError, match="lamp_of_face"):
+    with refused("lamp_of_face", "(40,)", 1):
         light_maps(scene, room.points, room.normals, room.group, 1, T.PathOptions(1, 1, 0))
     assert light_maps(scene, room.points[:0], room.normals[:0], room.group, 2, T.PathOptions(1, 1, 0)).shape == (0, 2, 3)
 

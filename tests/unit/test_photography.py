@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from iif_core.camera import response as families
 from iif_core.camera.simulation import STOPS, ResponseCurve, expose, exposures, response_curve
 from iif_core.errors import InputError
+from tests.errors import refused
 
 CURVES = ("filmic", "soft", "srgb", "linear")
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -52,7 +53,7 @@ def test_every_curve_that_is_accepted_rises(gamma, strength, pivot):
 
 
 def test_unknown_curve_is_refused():
-    with pytest.raises(InputError, match="'kodak'.*filmic, soft, srgb, linear"):
+    with refused("'kodak'", "filmic, soft, srgb, linear"):
         response_curve("kodak")
 
 
@@ -78,12 +79,12 @@ def test_expose_scales_radiance_before_the_response():
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
 def test_expose_refuses_bad_exposure(bad):
-    with pytest.raises(InputError, match="exposure"):
+    with refused("exposure", bad):
         expose(np.ones((2, 3)), bad)
 
 
 def test_expose_refuses_nan():
-    with pytest.raises(InputError, match="1 non-finite"):
+    with refused(1, "radiance"):
         expose(np.array([[np.nan, 0, 0]]), 1.0)
 
 
@@ -145,17 +146,17 @@ def test_extremes_black_views_masked_views_all_black():
 
 
 @pytest.mark.parametrize(
-    "arguments, message",
+    "arguments, names",
     [
-        (([],), "no view"),
-        (([np.ones((4, 2))],), "last axis"),
-        (([np.full((4, 3), np.nan)],), "non-finite"),
-        (([np.full((4, 3), -1.0)],), "negative"),
-        (([np.ones((4, 3))], [np.ones(3, bool)]), "mask of shape"),
-        (([np.ones((4, 3))], None, (2.0, 1.0)), "ascending"),
-        (([np.ones((4, 3))], None, STOPS, 0.18, 1.0), "saturated"),
+        (([],), ["view"]),
+        (([np.ones((4, 2))],), ["view 0", "(4, 2)"]),
+        (([np.full((4, 3), np.nan)],), ["view 0"]),
+        (([np.full((4, 3), -1.0)],), ["view 0"]),
+        (([np.ones((4, 3))], [np.ones(3, bool)]), ["view 0", "(3,)", "(4, 3)"]),
+        (([np.ones((4, 3))], None, (2.0, 1.0)), ["stops", "[2.0, 1.0]"]),
+        (([np.ones((4, 3))], None, STOPS, 0.18, 1.0), ["grey=0.18", "saturated=1.0"]),
     ],
 )
-def test_bad_input_is_named(arguments, message):
-    with pytest.raises(InputError, match=message):
+def test_bad_input_is_named(arguments, names):
+    with refused("exposures", *names):
         exposures(*arguments)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
+from tests.errors import refused
 from workflow.costs.work import SceneSize, work_of
 from workflow.priors import Predicted, files, learned, pooled, retinex
 from workflow.runtime import fingerprint as fp
@@ -42,7 +43,7 @@ def test_members_take_the_number_of_the_pool_unless_they_state_their_own(tmp_pat
     ],
 )
 def test_what_cannot_be_pooled_is_refused_with_its_key(tmp_path, prior, key):
-    with pytest.raises(InputError, match=f"room.yaml.*`{key}"):
+    with refused("config/scenes/room.yaml", key):
         scene(tmp_path, prior)
 
 

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from iif_core.camera.response import response
-from iif_core.errors import InputError
 from iif_core.fitting import object_levels
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import Gauge, apply_gauge
@@ -16,6 +15,7 @@ from iif_core.fitting.predictions import PredictionErrors
 from iif_core.fitting.problem import FitOptions
 from iif_core.fitting.selection import EVIDENCE_DISCOUNT, ROUGHNESS_GRID, Profile, choose_kinds
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
+from tests.errors import refused
 from tests.unit.planted_fit import problem_of
 
 ERRORS = PredictionErrors(0.15, 0.25, (0.57, 0.6, 0.9, 0.2), (3.4, 1.1))
@@ -49,7 +49,7 @@ def test_any_prediction_gives_finite_odds(metallic, roughness):
 )
 def test_facts_survive_and_wrong_ones_are_refused(change):
     assert PredictionErrors.from_facts(ERRORS.facts(), "recipe") == ERRORS
-    with pytest.raises(InputError, match="recipe"):
+    with refused("recipe", "object_errors"):
         PredictionErrors.from_facts(ERRORS.facts() | change, "recipe")
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import uniform_filter1d
 
 from iif_core.camera.registration import Photo, feature_image, register
-from iif_core.errors import InputError
+from tests.errors import refused
 from tests.unit.painted_room import FOCAL, look, off, posed, room, twisted
 
 
@@ -82,5 +82,5 @@ def test_a_blurred_view_and_a_badly_posed_one_stand_out(photos: list[Photo]) -> 
 
 
 def test_no_photograph_is_refused() -> None:
-    with pytest.raises(InputError, match="no photograph"):
+    with refused("registration", "photograph"):
         register([])

@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from iif_core.errors import InputError
 from iif_core.light.relighting import coloured, sum_of_lamps
 from iif_core.numerics.color import linear_from_srgb, luminance
+from tests.errors import misset, named, refused
 from tests.unit.test_relighting import lit
 from tests.unit.test_report import FakeJob, make_scene
 from workflow.artifacts import StageReader, StageWriter
@@ -79,9 +79,9 @@ def test_light_from_outside_is_a_lamp(T):
     found = render_lamps(scene, [-1], 1, *rays, T.PathOptions(64, 2, 0), step, environment_lamp=0)
     assert found[0, 0].tolist() == [1, 2, 3] and 0.3 < found[1, 0, 0] < 0.7
     assert not render_lamps(scene, [-1], 1, *rays, T.PathOptions(4, 2, 0), step).any()  # nobody asked for its light
-    with pytest.raises(InputError, match="lamp_of_face has shape"):
+    with refused("lamp_of_face", "(2,)", "(1,)"):
         render_lamps(scene, [0, 0], 1, *rays, T.PathOptions(4, 2, 0), step)
-    with pytest.raises(InputError, match="expected"):
+    with refused("lamp_of_face", 1, "0 ... 0"):
         render_lamps(scene, [1], 1, *rays, T.PathOptions(4, 2, 0), step)
 
 
@@ -89,7 +89,7 @@ def test_a_colour_keeps_the_luminance():
     found = np.array([8.0, 4.0, 1.0])
     blue = coloured(found, 0.5, [0.0, 0.2, 1.0])
     assert luminance(blue) == pytest.approx(0.5 * luminance(found)) and blue[0] == 0 and blue[2] == 5 * blue[1]
-    with pytest.raises(InputError, match="above 0"):
+    with refused("colour", "[0.0, 0.0, 0.0]"):
         coloured(found, 1.0, [0, 0, 0])
 
 
@@ -116,30 +116,37 @@ SPELLINGS = (("colour", "centre"), ("color", "center"))
 def test_settings_of_lamps_and_paint():
     lamps = entry(lamps={"a": "off", "b": False, 3: 0.5, "c": {"factor": True}})["lamps"]
     assert {key: lamp["factor"] for key, lamp in lamps.items()} == {"a": 0, "b": 0, "3": 0.5, "c": 1}
-    for bad, words in (
-        ({"lamps": {"a": -1}}, "greater than or equal"),
-        ({"lamps": {"a": {"colour": [0, 0, 0]}}}, "one of them above"),
-        ({"materials": {"a": {}}}, "nothing is edited"),
-        ({"materials": {"a": {"albedo": [0, 0, 0], "tint": [1, 1, 1]}}}, "remove one of the two"),
-        ({"materials": {"a": {"albedo": [2, 0, 0]}}}, "less than or equal"),
-        ({"camera": {"views": ["a"], "poses": [{"position": [0, 0, 0], "look_at": [1, 0, 0]}]}}, "both given"),
-        ({"video": {"codec": "hevc"}}, "'av1' or 'h264'"),
-        ({"method": "recombine", "sphere": {"center": [0, 0, 0], "path_to": [1, 0, 0]}}, "moves"),
-        ({"emitters": float("inf")}, "less than or equal|finite"),
-        ({"lamps": {"a": 1e300}}, "less than or equal"),
-        ({"lamps": {"a": {"move": [float("nan"), 0, 0]}}}, "finite"),
-        ({"sphere": {"center": [0, float("nan"), 0]}}, "finite"),
-        ({"sphere": {"center": [0, 0, 0], "radiance": [-1, 1, 1]}}, "greater than or equal"),
-        ({"insert": [{"file": "a.glb", "position": [0, 0, 0], "scale": float("inf")}]}, "finite"),
-        ({"environment_turn": float("nan")}, "finite"),
-        ({"environment": [float("inf"), 0, 0]}, "environment"),
-        ({"lamps": {"a": "#ff8800"}}, "a colour is linear R, G, B"),
-        ({"camera": {"views": ["a"], "frames": 24}}, "24 frames and stands still"),
-        ({"camera": {"views": ["a", "b"]}}, "takes one picture; give the number of its `frames`"),
-        ({"video": {"codec": "h264"}}, "takes one picture; give the number of its `frames`, or leave out"),
-        ({"camera": {"poses": [{"position": [0, 1, 2], "look_at": [0, 1, 2]}]}}, "the same point"),
+    finite, least, most, ours = "finite_number", "greater_than_equal", "less_than_equal", "value_error"
+    for bad, *fault in (
+        ({"lamps": {"a": -1}}, "lamps.a.factor", least, 0),
+        ({"lamps": {"a": {"colour": [0, 0, 0]}}}, "lamps.a.colour", ours, "off"),
+        ({"materials": {"a": {}}}, "materials.a", ours, "albedo", "tint", "roughness", "metallic"),
+        ({"materials": {"a": {"albedo": [0, 0, 0], "tint": [1, 1, 1]}}}, "materials.a", ours, "albedo", "tint"),
+        ({"materials": {"a": {"albedo": [2, 0, 0]}}}, "materials.a.albedo.0", most, 1),
+        (
+            {"camera": {"views": ["a"], "poses": [{"position": [0, 0, 0], "look_at": [1, 0, 0]}]}},
+            "camera",
+            ours,
+            "views",
+            "poses",
+        ),
+        ({"video": {"codec": "hevc"}}, "video.codec", "literal_error", "'av1'", "'h264'"),
+        ({"method": "recombine", "sphere": {"center": [0, 0, 0], "path_to": [1, 0, 0]}}, "", ours, "method: recombine", "sphere"),
+        ({"emitters": float("inf")}, "emitters", finite),
+        ({"lamps": {"a": 1e300}}, "lamps.a.factor", most, 1_000_000_000),
+        ({"lamps": {"a": {"move": [float("nan"), 0, 0]}}}, "lamps.a.move.0", finite),
+        ({"sphere": {"center": [0, float("nan"), 0]}}, "sphere.center.1", finite),
+        ({"sphere": {"center": [0, 0, 0], "radiance": [-1, 1, 1]}}, "sphere.radiance.0", least, 0),
+        ({"insert": [{"file": "a.glb", "position": [0, 0, 0], "scale": float("inf")}]}, "insert.0.scale", finite),
+        ({"environment_turn": float("nan")}, "environment_turn", finite),
+        ({"environment": [float("inf"), 0, 0]}, "environment.0", finite),
+        ({"lamps": {"a": "#ff8800"}}, "lamps.a", ours, "on", "off", "{colour: [1, 0.5, 0.2]}"),
+        ({"camera": {"views": ["a"], "frames": 24}}, "", ours, "camera", 24, "frames"),
+        ({"camera": {"views": ["a", "b"]}}, "", ours, "camera", "views", "poses", "frames"),
+        ({"video": {"codec": "h264"}}, "", ours, "video", "frames"),
+        ({"camera": {"poses": [{"position": [0, 1, 2], "look_at": [0, 1, 2]}]}}, "camera.poses.0", ours, "[0.0, 1.0, 2.0]"),
     ):
-        with pytest.raises(ValidationError, match=words):
+        with misset(*fault):
             entry(**bad)
     assert entry(video="off")["video"] is None and entry()["video"] == {"fps": 24, "codec": "av1"}
     british, american = (entry(lamps={"a": {ou: [1, 0, 0]}}, sphere={re: [0, 1, 2]}) for ou, re in SPELLINGS)
@@ -291,7 +298,7 @@ def test_materials_of_moved_and_textured_faces(T):
             (1 - abs(x - i - a)) * (1 - abs(y - j - b)) * image[(j + b) % 3, (i + a) % 4] for a in (0, 1) for b in (0, 1)
         )
         np.testing.assert_allclose(row, expected, atol=2e-5)
-    with pytest.raises(InputError, match="textures of 2 faces"):
+    with refused("2 faces", "(2, 8)"):
         EditedMaterials(by_place, 4, None, textures._replace(width=np.array([4, 40])))
     dr.eval(colour)
 
@@ -405,7 +412,7 @@ def test_emission_that_is_not_read_is_refused_and_the_rest_is_named(tmp_path):
     picture = Image.fromarray(np.full((2, 2, 3), 200, np.uint8))
     screen = made("screen", emissiveTexture=picture, emissiveFactor=[1, 1, 1])
     put = entry(insert=[{"file": str(tmp_path / "screen.glb"), "position": [0, 0, 0]}])["insert"][0]
-    with pytest.raises(InputError, match=r"screen.glb: material 'screen' has a texture of emission, .* or give `radiance`"):
+    with refused("screen.glb", "'screen'", "emissiveFactor", "radiance"):
         light_of(screen, put)
     assert light_of(screen, {**put, "radiance": [0, 1, 0]}).tolist() == [[0, 1, 0]]
     dark = made("dark", emissiveTexture=picture, emissiveFactor=[0, 0, 0])
@@ -418,7 +425,7 @@ def test_emission_that_is_not_read_is_refused_and_the_rest_is_named(tmp_path):
     assert emissive_strengths(path) == {}
     document["materials"][1]["extensions"]["KHR_materials_emissive_strength"]["emissiveStrength"] = 4
     path.write_text(json.dumps(document))
-    with pytest.raises(InputError, match="two materials are called 'a' and shine with different strength; rename one"):
+    with refused(path, "'a'"):
         emissive_strengths(path)
 
 
@@ -427,7 +434,7 @@ def test_strengths_of_emission_that_are_no_radiance_are_refused(tmp_path, streng
     material = f'{{"name": "a", "extensions": {{"KHR_materials_emissive_strength": {{"emissiveStrength": {strength}}}}}}}'
     path = tmp_path / "one.gltf"
     path.write_text(f'{{"asset": {{}}, "materials": [{material}]}}')
-    with pytest.raises(InputError, match=r"one.gltf: (the material 'a' shines with a strength of|not readable as glTF)"):
+    with refused(path):
         emissive_strengths(path)
 
 
@@ -435,14 +442,14 @@ def test_strengths_of_emission_that_are_no_radiance_are_refused(tmp_path, streng
 def test_emission_that_is_no_radiance_is_refused(tmp_path, factor):
     mesh = replace(load_insert(plate(tmp_path / "plate.glb")), radiance=np.array([factor]))
     put = entry(insert=[{"file": "plate.glb", "position": [0, 0, 0]}])["insert"][0]
-    with pytest.raises(InputError, match="plate.glb: a material emits light that is no number of 0 ... 1e"):
+    with refused("plate.glb", "0 ... 1e+09", "radiance"):
         light_of(mesh, put)
     assert light_of(mesh, {**put, "radiance": [0, 1, 0]}).tolist() == [[0, 1, 0]] * len(mesh.corners)
 
 
 def test_a_map_of_the_environment_that_is_no_picture_is_blamed_by_its_own_key(tmp_path):
     (tmp_path / "sky.exr").write_bytes(b"no picture")
-    with pytest.raises(InputError, match=r"^`relight.environment` of .*sky.exr: not a readable EXR image"):
+    with refused("relight.environment", "a", tmp_path / "sky.exr", "EXR"):
         relight_files([entry(environment=str(tmp_path / "sky.exr"))])
 
 
@@ -469,30 +476,30 @@ def test_broken_meshes_are_refused(tmp_path):
 
     whole = plate(tmp_path / "plate.glb").read_bytes()
     (tmp_path / "short.glb").write_bytes(whole[:-40])
-    assert "cut short (its header announces" in said(tmp_path / "short.glb")
+    named(said(tmp_path / "short.glb"), len(whole), len(whole) - 40)
     for kind in (".glb", ".gltf", ".ply", ".obj"):
         (tmp_path / f"nothing{kind}").touch()
-        assert f"nothing{kind}: empty (0 bytes)" in said(tmp_path / f"nothing{kind}")
+        named(said(tmp_path / f"nothing{kind}"), 0)
     (tmp_path / "text.glb").write_text("not a mesh, and longer than its header")
-    assert "does not begin with `glTF`" in said(tmp_path / "text.glb")
+    named(said(tmp_path / "text.glb"), "GLB", "`glTF`")
     spoilt = bytearray(whole)
     spoilt[24:30] = b"??????"
     (tmp_path / "spoilt.glb").write_bytes(spoilt)
-    assert "not readable as glTF" in said(tmp_path / "spoilt.glb")
+    named(said(tmp_path / "spoilt.glb"), "glTF")
     document = {"asset": {"version": "2.0"}, "images": [{"uri": "wodo.png"}]}
     (tmp_path / "wood.png").touch()
     (tmp_path / "a.gltf").write_text(json.dumps(document))
-    assert "texture" in said(tmp_path / "a.gltf") and "Did you mean" in said(tmp_path / "a.gltf")
+    named(said(tmp_path / "a.gltf"), tmp_path / "wodo.png", tmp_path / "wood.png")
     (tmp_path / "b.gltf").write_text(json.dumps({"asset": {}, "extensionsRequired": ["KHR_draco_mesh_compression"]}))
-    assert "KHR_draco_mesh_compression" in said(tmp_path / "b.gltf")
+    named(said(tmp_path / "b.gltf"), "KHR_draco_mesh_compression")
     (tmp_path / "c.gltf").write_text(json.dumps({"asset": {"version": "2.0"}}))
-    assert "no triangles" in said(tmp_path / "c.gltf") or "not readable as a mesh" in said(tmp_path / "c.gltf")
+    named(said(tmp_path / "c.gltf"), "c.gltf")
     (tmp_path / "d.ply").write_text("plyers")
-    assert "cut short" in said(tmp_path / "d.ply")
+    named(said(tmp_path / "d.ply"), "d.ply", "header")
     (tmp_path / "e.obj").write_text("mtllib nothing.mtl\nv 0 0 0\n")
-    assert "file of materials" in said(tmp_path / "e.obj")
-    assert "not found" in said(tmp_path / "plat.glb") and "Did you mean" in said(tmp_path / "plat.glb")
-    assert "allowed: a mesh that ends in .glb" in said(tmp_path / "mesh.fbx")
+    named(said(tmp_path / "e.obj"), tmp_path / "nothing.mtl")
+    named(said(tmp_path / "plat.glb"), tmp_path / "plat.glb", tmp_path / "plate.glb")
+    named(said(tmp_path / "mesh.fbx"), ".fbx", ".glb, .gltf, .ply, .obj")
 
 
 # --------------------------------------------------------------------------------------------------- what does not exist
@@ -506,16 +513,16 @@ def things():
 def test_lamps_are_called_by_object_or_id(things):
     assert things.lamps_called("window", "x") == [0] and things.lamps_called("4", "x") == [1]
     assert things.lamps_called("bulb", "x") == [1, 2]
-    for key, words in (
-        ("windw", r"no lamp 'windw'\. Did you mean 'window'\? Lamps of this room: 0 \(window\), 4 \(bulb\)"),
-        ("7", "no lamp '7'"),
-        ("wall", "object 'wall' does not shine"),
+    for key, names in (
+        ("windw", ["'windw'", "'window'", "0 (window), 4 (bulb)"]),
+        ("7", ["'7'", "0 (window), 4 (bulb)"]),
+        ("wall", ["object 'wall'", "0 (window), 4 (bulb)"]),
     ):
-        with pytest.raises(InputError, match=words):
+        with refused("relight.lamps", "a", *names):
             things.check(entry(lamps={key: "off"}))
-    with pytest.raises(InputError, match="are the same lamp, 4"):
+    with refused("relight.lamps", "a", "'4'", "'bulb'", 4):
         things.check(entry(lamps={"bulb": 1, 4: 2}))
-    with pytest.raises(InputError, match=r"relight.materials of a: there is no object 'wal'\. Did you mean 'wall'"):
+    with refused("relight.materials", "a", "'wal'", "'wall'"):
         things.check(entry(materials={"wal": {"metallic": 0}}))
 
 
@@ -525,12 +532,10 @@ def test_a_way_through_a_wall_is_named(toy):
     }
     camera |= {"frames": 5, "width": 16, "height": 16}
     wanted = {"name": "out", "camera": camera, "samples": 1, "video": False}
-    said = (
-        r"^config/scenes/toy.yaml: relight.camera of out: the way of the camera leads through 'walls' at \[0.30, 0.00, 1.60\] m,"
-    )
-    with pytest.raises(InputError, match=rf"{said} between frames 1 and 2"):
+    where = ("config/scenes/toy.yaml", "relight.camera", "out", "'walls'", "[0.30, 0.00, 1.60]")
+    with refused(*where, "1 and 2", "through_surface: true"):
         lit(toy, wanted)
-    with pytest.raises(InputError, match="leads through 'walls'"):
+    with refused(*where):
         lit(toy, {**wanted, "method": "path"})
     _, folder = lit(toy, {**wanted, "camera": {**camera, "through_surface": True}})
     assert (folder / "out/frame_0004.png").is_file() and not (folder / "out/video.mp4").exists()
@@ -539,9 +544,9 @@ def test_a_way_through_a_wall_is_named(toy):
 def test_nothing_is_rendered_before_everything_was_checked(toy, monkeypatch):
     monkeypatch.setattr(relight, "trace_picture", lambda *_: pytest.fail("rendered although the second relighting is wrong"))
     for key, far in (("center", {"center": [0, 0, 70]}), ("path_to", {"center": [0, 0, 1], "path_to": [0, 0, 70]})):
-        with pytest.raises(InputError, match=f"relight.sphere.{key} of b: .* m away from the room"):
+        with refused(f"relight.sphere.{key}", "b", "[0.0, 0.0, 70.0]"):
             lit(toy, {"name": "a", "method": "path"}, {"name": "b", "sphere": far})
-    with pytest.raises(InputError, match="no lamp 'lmap'"):
+    with refused("relight.lamps", "b", "'lmap'", "'lamp'"):
         lit(toy, {"name": "a", "method": "path"}, {"name": "b", "lamps": {"lmap": 0}, "method": "path"})
 
 
@@ -624,7 +629,7 @@ def test_a_video_leaves_the_scheduling_of_the_thread_as_it_was():
 
 def test_a_codec_that_is_not_there_is_named(monkeypatch):
     monkeypatch.setitem(video.ENCODERS, "av1", "libnothing")
-    with pytest.raises(InputError, match="codec of flight: found 'av1', whose encoder libnothing .* allowed here: h264"):
+    with refused("relight.video.codec", "flight", "'av1'", "libnothing", "h264"):
         video.require_codec("av1", "flight")
     video.require_codec("h264", "flight")
 
@@ -682,15 +687,15 @@ def test_plans_are_found_and_checked(tmp_path):
     place, layer = relight_plans.plan_layer("night", tmp_path)
     assert place == "config/relight/night.yaml" and layer["relight"][1]["insert"][0]["file"] == str(folder / "plate.glb")
     assert relight_plans.active_plan("night", tmp_path) == "night" and relight_plans.active_plan("x", tmp_path) == "example"
-    for text, words in (
-        ("title: t\n", "`relight`: no relightings; needed is a list"),
-        ("title: 5\nrelight: [{name: a}]\n", "`title`: found 5"),
-        ("relihgt: []\n", "unknown key. Did you mean `relight`"),
+    for text, names in (
+        ("title: t\n", ["relight", "config/relight/kitchen.yaml"]),
+        ("title: 5\nrelight: [{name: a}]\n", ["title", 5]),
+        ("relihgt: []\n", ["relihgt", "relight"]),
     ):
         (folder / "bad.yaml").write_text(text)
-        with pytest.raises(InputError, match=words):
+        with refused("config/relight/bad.yaml", *names):
             relight_plans.plan_layer("bad", tmp_path)
-    with pytest.raises(InputError, match=r"config/relight/nihgt.yaml: not found. Did you mean night\? Known plans .*bad, night"):
+    with refused("config/relight/nihgt.yaml", "night", "bad, night"):
         relight_plans.plan_layer("nihgt", tmp_path)
 
 
@@ -700,15 +705,15 @@ def test_mistakes_in_a_plan_are_blamed_on_it(tmp_path, repository):
     for part in ("relight", "scenes"):
         (tmp_path / f"config/{part}").mkdir(parents=True)
     shutil.copy(repository / "config/scenes/kitchen.yaml", tmp_path / "config/scenes/room.yaml")
-    for entries, words in (
-        ("{name: a, lamsp: {bulb: off}}", "`relight.0.lamsp`: unknown key. Did you mean `lamps`"),
-        ("{name: a b/c}", "`relight.0.name`: found 'a b/c'. Needed: letters, digits, _ and -"),
-        ("{name: a}, {name: a}", "`relight`: 2 relightings are called 'a'; each needs its own name"),
-        ("{name: a, camera: {views: [003]}}", '`relight.0.camera.views.0`: found 3. .* write it in quotes, such as "003"'),
-        ("{name: a, insert: [{file: a.glb}]}", "`relight.0.insert.0.position`: missing. Add it; config/relight/kitchen.yaml"),
+    for entries, names in (
+        ("{name: a, lamsp: {bulb: off}}", ["relight.0.lamsp", "lamps"]),
+        ("{name: a b/c}", ["relight.0.name", "'a b/c'", "_", "-"]),
+        ("{name: a}, {name: a}", ["relight", 2, "'a'"]),
+        ("{name: a, camera: {views: [003]}}", ["relight.0.camera.views.0", 3, '"003"']),
+        ("{name: a, insert: [{file: a.glb}]}", ["relight.0.insert.0.position", "config/relight/kitchen.yaml"]),
     ):
         (tmp_path / "config/relight/night.yaml").write_text(f"relight: [{entries}]\n")
-        with pytest.raises(InputError, match=f"config/relight/night.yaml: {words}"):
+        with refused("config/relight/night.yaml", *names):
             settings.load("room--relight-night-s0", "draft", tmp_path)
     (tmp_path / "config/relight/night.yaml").write_text("relight: [{name: a, lamps: {bulb: off}}]\n")
     found = settings.dump(settings.load("room--relight-night-s0", "draft", tmp_path))
@@ -756,19 +761,17 @@ def test_what_is_known_before_the_jobs_is_told_before_them(toy, monkeypatch):
         return str(error.value)
 
     check.check_relightings({"relight": [entry(lamps={"lamp": 0}, materials={"walls": {"metallic": 0}})]}, "toy", "draft")
-    assert told(materials={"wals": {"metallic": 0}}).startswith(
-        "config/scenes/toy.yaml: relight.materials of a: there is no object"
-    )
-    assert "there is no lamp 'lmap'. Did you mean 'lamp'" in told(lamps={"lmap": 0})
-    assert "found v7; the views are v0, v1" in told(camera={"views": ["v7"]})
+    named(told(materials={"wals": {"metallic": 0}}), "config/scenes/toy.yaml", "relight.materials", "a", "'wals'", "'walls'")
+    named(told(lamps={"lmap": 0}), "relight.lamps", "'lmap'", "'lamp'")
+    named(told(camera={"views": ["v7"]}), "relight.camera.views", "v7", "v0, v1")
     far = {"position": [90, 0, 0], "look_at": [0, 0, 0]}
     several = told(lamps={"lmap": 0, "walls": 0}, materials={"wals": {"metallic": 0}}, camera={"poses": [far]}).splitlines()
     assert [line.split(" of a: ")[0] for line in several] == [
         f"config/scenes/toy.yaml: relight.{key}" for key in ("camera.poses.0.position", "lamps", "lamps", "materials")
     ]
-    assert "[90.0, 0.0, 0.0] is 8" in several[0] and "away from the room, which reaches from [" in several[0]
+    named(several[0], "[90.0, 0.0, 0.0]", "[0.0, 0.0, 0.0]", "[3.0, 2.0, 2.5]")
     monkeypatch.setitem(video.ENCODERS, "av1", "libnothing")
-    assert "libnothing" in told(camera={"views": ["v0", "v1"], "frames": 2})
+    named(told(camera={"views": ["v0", "v1"], "frames": 2}), "relight.video.codec", "libnothing")
     monkeypatch.setattr(check, "finished", lambda *_: None)  # nothing is known yet, and nothing is refused
     check.check_relightings({"relight": [entry(lamps={"lmap": 0})]}, "toy", "draft")
 
@@ -799,5 +802,5 @@ def test_held_out_photographs_lend_their_camera_but_not_their_exposure(studio):
 
 def test_frames_that_an_encoder_refuses_are_told(monkeypatch):
     monkeypatch.setitem(video.OPTIONS, "h264", {"preset": "no such preset"})
-    with pytest.raises(InputError, match="h264 refuses these frames .* or `video: off`"):
+    with refused("relight.video", "h264", "codec", "video: off"):
         video.encoded([np.zeros((16, 16, 3), np.uint8)], 24, "h264")

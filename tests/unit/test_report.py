@@ -15,8 +15,8 @@ import pytest
 import yaml
 
 from iif_core.camera.pinhole import direction_derivatives, look_at, pixel_directions
-from iif_core.errors import InputError
 from iif_core.surface.cells import grid_origin, voxel_indices
+from tests.errors import refused
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.files import read_exr, read_parquet, sha256_of
@@ -310,7 +310,7 @@ def test_response_is_read_back(toy):
 
 def test_response_of_different_grids_is_refused():
     table = {"channel": np.array(["r", "g", "b", "b"]), "kind": np.array(["sample"] * 4), "x": np.array([0, 0, 0, 1.0])}
-    with pytest.raises(InputError, match="same x"):
+    with refused("camera_response.parquet", "r, g, b", "--forcerun affines"):
         response_samples(table | {"value": np.zeros(4)})
 
 
@@ -478,7 +478,7 @@ def test_a_copy_that_differs_from_what_a_stage_wrote_is_not_published(toy, tmp_p
 
     with monkeypatch.context() as disk:
         disk.setattr(publish, "copy", harmful)
-        with pytest.raises(InputError, match=r"objects.parquet: the copy differs from what rule affines wrote"):
+        with refused("scenes/.toy.tmp/objects.parquet", "affines", "results/toy/affines/objects.parquet"):
             publish.run(FakeJob("publish", place))
         assert (place / "scenes/toy/manifest.json").read_bytes() == before
     path = place / "scenes/toy/objects.parquet"  # as if it had been published nevertheless
@@ -659,7 +659,7 @@ def test_commands_name_scene_and_quality():
 
 def test_page_says_what_matters(toy):
     text = "".join(parsed((toy / "scenes/toy/report.html").read_text()).text)
-    for wanted in ("geometry: good", "1 lamp found", "How do I go on?", "objects.csv", "snakemake --cores 2 relight/toy"):
+    for wanted in ("geometry: good", "1 lamp found", "What next?", "objects.csv", "snakemake --cores 2 relight/toy"):
         assert wanted in text
     for wanted in (
         "by <nobody> & co",

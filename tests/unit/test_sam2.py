@@ -11,6 +11,7 @@ import torch
 
 from iif_core.errors import InputError
 from iif_core.objects.mask_proposals import point_grid, suppress_overlaps, threshold_stability
+from tests.errors import misset, named, refused
 from tests.unit import own_scene as own
 from tests.unit import tiny_sam2
 from workflow import settings as settings_module
@@ -204,7 +205,7 @@ def test_a_killed_stage_goes_on_where_it_was(made, tmp_path, monkeypatch):
 
 def test_no_mask_in_any_view_is_refused(made, tmp_path):
     scene(tmp_path, made, confidence=1.0)
-    with pytest.raises(InputError, match="SAM 2 found no mask in any of 4 views"):
+    with refused("SAM 2", 4, "segmentation.sam2.confidence"):
         own.run(tmp_path, "segmentation")
 
 
@@ -225,19 +226,19 @@ def test_a_good_checkpoint_is_its_files(made):
 
 
 def test_what_is_refused(copied, tmp_path, monkeypatch):
-    message = refusal(copied, accept_license=False)
-    assert "`segmentation.sam2.accept_license`: found false. facebook/sam2.1-hiera-large comes under the Apache" in message
-    assert "set `segmentation: {sam2: {accept_license: true}}`" in message
-    assert "not found; `segmentation.sam2.checkpoint` is a folder in transformers' layout" in refusal(tmp_path / "nowhere")
+    model, licence = "facebook/sam2.1-hiera-large", "Apache License 2.0"
+    agree = "segmentation: {sam2: {accept_license: true}}"
+    named(refusal(copied, accept_license=False), "segmentation.sam2.accept_license", model, licence, agree)
+    named(refusal(tmp_path / "nowhere"), tmp_path / "nowhere", "segmentation.sam2.checkpoint", f"hf download {model}", licence)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
-    assert "holds nothing of it" in refusal("facebook/sam2.1-hiera-large")
+    named(refusal(model), "segmentation.sam2.checkpoint", tmp_path / "hub", f"hf download {model}", licence)
     monkeypatch.setattr(checkpoint.importlib.metadata, "version", lambda _: "2.13.0+cpu")
-    assert "`segmentation.sam2.device`: found cuda, but torch is the CPU build" in refusal(copied, device="cuda")
+    named(refusal(copied, device="cuda"), "segmentation.sam2.device", "cuda", "2.13.0+cpu", "envs/README.md")
     config = json.loads((copied / "config.json").read_text())
     (copied / "config.json").write_text(json.dumps({**config, "model_type": "sam"}))
-    assert "`model_type` is sam, needed sam2 or sam2_video: this is another model" in refusal(copied)
+    named(refusal(copied), copied / "config.json", "`model_type`", "sam", "sam2 or sam2_video")
     (copied / "config.json").unlink()
-    assert "config.json: not found; `segmentation.sam2.checkpoint` needs a folder in transformers' layout" in refusal(copied)
+    named(refusal(copied), copied / "config.json", "segmentation.sam2.checkpoint", "docs/guide/segmentation.md")
 
 
 def test_damaged_weights_are_refused(copied):
@@ -247,14 +248,15 @@ def test_damaged_weights_are_refused(copied):
     tensors = load_file(stored)
     tensors.pop("mask_decoder.iou_token.weight")
     save_file(tensors, stored, {"format": "pt"})
-    with pytest.raises(InputError, match="1 weights missing or of another shape, such as mask_decoder.iou_token.weight"):
+    with refused(copied, 1, "mask_decoder.iou_token.weight", "config.json"):
         generator(copied)
-    stored.write_bytes(stored.read_bytes()[:-100])
-    assert "cut short, download it again" in refusal(copied)
+    whole = stored.read_bytes()
+    stored.write_bytes(whole[:-100])
+    named(refusal(copied), stored, len(whole) - 100, len(whole))
     stored.rename(copied / "model.bin")
-    assert "no model.safetensors" in refusal(copied) and "is a pickle" in refusal(copied)
+    named(refusal(copied), copied, "model.safetensors", "model.bin")
 
 
 def test_masks_come_from_one_place():
-    with pytest.raises(ValueError, match="`path` names masks to read, `sam2` makes them"):
+    with misset("", "value_error", "path", "sam2"):
         settings_module.UNIONS["segmentation"]["masks"].model_validate({"kind": "masks", "path": "x", "sam2": {}})

@@ -8,6 +8,7 @@ import pytest
 
 from iif_core.camera.distortion import pinhole_inside
 from iif_core.errors import InputError
+from tests.errors import named, refused
 from tests.unit import own_scene as own
 from tests.unit import scannetpp_scene as mini
 from workflow import settings
@@ -43,7 +44,7 @@ def copy(release, tmp_path):
     return home
 
 
-def refused(home, capture=None, **source):
+def refusal(home, capture=None, **source):
     source = {"kind": "scannetpp", "path": str(home), **source}
     tree = {"source": source, "capture": capture or {}, "segmentation": {"kind": "given"}}
     document = settings.dump(settings.SceneSettings.model_validate(tree))
@@ -174,55 +175,55 @@ def test_undistorted_images_of_the_toolbox(release, copy, tmp_path):
 
 
 def test_wrong_world_is_named_by_colmap(copy):
-    message = refused(copy, world="mesh")
-    assert "its cameras differ from those of" in message and "`source.world: nerfstudio` fits" in message
+    both = (copy / "dslr/nerfstudio/transforms.json", copy / "dslr/colmap/images.txt")
+    named(refusal(copy, world="mesh"), *both, "source.world: nerfstudio")
     path = copy / "dslr/nerfstudio/transforms.json"
     document = json.loads(path.read_text())
     for entry in document["frames"] + document["test_frames"]:
         entry["transform_matrix"][0][3] += 0.5
     path.write_text(json.dumps(document))
-    assert "(median 0.5 m, 0.0 degrees" in (message := refused(copy)) and "download both again" in message
+    named(refusal(copy), *both, "0.5 m", "0.0 degrees")
 
 
 @pytest.mark.parametrize(
-    ("gone", "words"),
+    ("gone", "names"),
     [
-        ("dslr/nerfstudio/transforms.json", "it is part of the release"),
-        ("scans/mesh_aligned_0.05.ply", "download the scene's `scans` too"),
-        ("scans/segments.json", "segments.json: not found; `segmentation: {kind: given}` takes"),
-        ("scans/segments_anno.json", "segments_anno.json: not found; `segmentation: {kind: given}` takes"),
-        ("dslr/resized_images/DSC00001.JPG", "1 image(s) not found"),
-        ("dslr/resized_anon_masks/DSC00001.png", "1 mask(s) not found"),
+        ("dslr/nerfstudio/transforms.json", ["source.images", "dslr, undistorted"]),
+        ("scans/mesh_aligned_0.05.ply", ["scans"]),
+        ("scans/segments.json", ["segmentation: {kind: given}", "segmentation: {kind: geometry}"]),
+        ("scans/segments_anno.json", ["segmentation: {kind: given}", "segmentation: {kind: geometry}"]),
+        ("dslr/resized_images/DSC00001.JPG", [1, "file_path"]),
+        ("dslr/resized_anon_masks/DSC00001.png", [1]),
     ],
 )
-def test_missing_files_are_named(copy, gone, words):
+def test_missing_files_are_named(copy, gone, names):
     (copy / gone).unlink()
-    message = refused(copy)
-    assert words in message and str(copy) in message
+    named(refusal(copy), copy / gone, *names)
 
 
 @pytest.mark.parametrize(
-    ("damaged", "keep", "words"),
+    ("damaged", "keep", "names"),
     [
-        ("scans/mesh_aligned_0.05.ply", b"<!DOCTYPE html>", "not a PLY file (it begins with b'<!DOCTYPE html>'"),
-        ("scans/mesh_aligned_0.05.ply", 0, "empty (0 bytes)"),
-        ("scans/mesh_aligned_0.05.ply", 0.1, "cut short (its header announces"),
-        ("dslr/resized_anon_masks/DSC00001.png", 0, "not a readable image"),
-        ("dslr/resized_anon_masks/DSC00001.png", 0.5, "cut short"),
+        ("scans/mesh_aligned_0.05.ply", b"<!DOCTYPE html>", ["PLY", "b'<!DOCTYPE html>'"]),
+        ("scans/mesh_aligned_0.05.ply", 0, [0]),
+        ("scans/mesh_aligned_0.05.ply", 0.1, ["vertex", "face"]),
+        ("dslr/resized_anon_masks/DSC00001.png", 0, ["PNG, JPEG"]),
+        ("dslr/resized_anon_masks/DSC00001.png", 0.5, []),
     ],
 )
-def test_damaged_downloads_are_refused_while_planning(copy, damaged, keep, words):
+def test_damaged_downloads_are_refused_while_planning(copy, damaged, keep, names):
     data = (copy / damaged).read_bytes()
     (copy / damaged).write_bytes(keep if isinstance(keep, bytes) else data[: int(len(data) * keep)])
-    message = refused(copy)
-    assert message.startswith(f"{copy / damaged}: {words}")
+    message = refusal(copy)
+    assert message.startswith(f"{copy / damaged}: ")
+    named(message, *names)
 
 
 @pytest.mark.parametrize("gone", [("segments.json",), ("segments_anno.json",), ("segments.json", "segments_anno.json")])
 def test_a_scene_without_annotation_needs_another_segmentation(copy, gone):
     for name in gone:
         (copy / "scans" / name).unlink()
-    assert "set `segmentation: {kind: geometry}`" in refused(copy)
+    named(refusal(copy), "segmentation: {kind: geometry}")
     source = {"kind": "scannetpp", "path": str(copy)}
     tree = {"source": source, "segmentation": {"kind": "geometry"}}
     document = settings.dump(settings.SceneSettings.model_validate(tree))
@@ -235,15 +236,15 @@ def test_a_scene_without_annotation_needs_another_segmentation(copy, gone):
 def test_other_refusals(copy, tmp_path):
     (tmp_path / "data").mkdir()
     shutil.copytree(copy / "dslr", tmp_path / "data/scene/dslr")
-    assert "is the folder of one ScanNet++ scene" in refused(tmp_path / "data")
-    assert "the toolbox makes it" in refused(copy, images="undistorted")
+    named(refusal(tmp_path / "data"), "dslr/", "source.path", tmp_path / "data/scene")
+    named(refusal(copy, images="undistorted"), "transforms_undistorted.json", "dslr.undistort", "source.images")
     lists = copy / "dslr/train_test_lists.json"
     stated = json.loads(lists.read_text())
     lists.write_text(json.dumps(stated | {"test": stated["train"][:1]}))
-    assert "is in both lists" in refused(copy)
+    named(refusal(copy), lists, "DSC00000.JPG", 1)
     lists.write_text("{}")
-    assert 'expected {"train": [names]' in refused(copy)
-    assert "8-bit" not in refused(copy, {"dynamic_range": "hdr"})
+    named(refusal(copy), lists, '{"train": [names], "test": [names]}')
+    assert "8-bit" not in refusal(copy, {"dynamic_range": "hdr"})
 
 
 def test_lists_without_pose_hidden_tests_and_train_alone(copy, tmp_path):
@@ -278,9 +279,9 @@ def test_overlapping_groups_and_foreign_segments(tmp_path):
     assert found.names[12] == "cushion 12"
     np.testing.assert_array_equal(mesh.majority_id(np.array([[3, 3, 12], [3, 12, 12], [12, 3, 12], [3, 12, 4]])), [3, 12, 12, -1])
     (tmp_path / "a.json").write_text(json.dumps({"groups": []}))
-    with pytest.raises(InputError, match="expected `segGroups`"):
+    with refused("a.json", "segGroups"):
         scannetpp.vertex_ids(tmp_path / "s.json", tmp_path / "a.json")
     vertices, faces, _ = own.room_mesh()
     own.save_mesh(tmp_path / "mesh.ply", vertices, faces)
-    with pytest.raises(InputError, match="ids of 7 vertices, mesh.ply has 16"):
+    with refused("s.json", 7, "mesh.ply", 16):
         mesh.load(tmp_path / "mesh.ply", 1.0, found)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from iif_core.errors import InputError
+from tests.errors import refused
 from tests.unit import own_scene as own
 from workflow.artifacts import StageReader
 from workflow.artifacts.store import ids_from_disk
@@ -105,5 +105,5 @@ def test_geometry(tmp_path):
 def test_given_without_ids_says_what_to_do(tmp_path):
     path = own.project(tmp_path, segmentation={"kind": "given"})
     own.photographed(path, 2, depth=False)
-    with pytest.raises(InputError, match="set `segmentation: {kind: geometry}`"):
+    with refused("segmentation: {kind: given}", "segmentation: {kind: geometry}"):
         own.run(tmp_path, "capture", "segmentation")

@@ -8,6 +8,7 @@ import pytest
 
 from iif_core.errors import InputError
 from iif_core.fusion.options import FusionOptions
+from tests.errors import missing, refused
 from workflow import settings
 from workflow.registry import STAGES
 from workflow.settings import batch_table, loading, study_files, yaml_file
@@ -47,25 +48,24 @@ def test_noise_of_the_light_can_be_set(scene):
     for text in ("0.05", "5e-2", "'0.05'"):  # YAML reads a number without a dot and with an exponent as a word
         assert settings.load("x", "draft", scene(f"{GOOD}shading: {{noise: {text}}}\n")).shading.noise == 0.05
     for wrong in ("0", "-0.1", "some", "true"):
-        with pytest.raises(InputError, match=r"`shading.noise`: found .*'auto' or a number above 0") as error:
+        with refused("config/scenes/x.yaml", "shading.noise", "'auto'", 0) as error:
             settings.load("x", "draft", scene(f"{GOOD}shading: {{noise: {wrong}}}\n"))
         assert len(str(error.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "names"),
     [
-        ("shading: {pixels: 1000}\naffines: {pixels: 5000}", ["`shading: pixels` is 1000", "reads 5000", "at least `5000`"]),
-        ("shading: {pixels: 1000}\naffines: {texture: photographs}", ["texture from the photographs reads every pixel"]),
-        ("shading: {pixels: some}", ["shading.pixels", "'auto', 'all' or a whole number of at least 100", "some"]),
-        ("shading: {pixels: 5}", ["shading.pixels", "'auto', 'all' or a whole number of at least 100", "found 5"]),
-        ("shading: {pixels: true}", ["'auto', 'all' or a whole number of at least 100"]),
+        ("shading: {pixels: 1000}\naffines: {pixels: 5000}", ["shading: pixels", 1000, "affines: pixels", "`5000`"]),
+        ("shading: {pixels: 1000}\naffines: {texture: photographs}", ["shading: pixels", 1000, "texture", "`all`"]),
+        ("shading: {pixels: some}", ["shading.pixels", "'some'", "'auto', 'all'", 100]),
+        ("shading: {pixels: 5}", ["shading.pixels", 5, "'auto', 'all'", 100]),
+        ("shading: {pixels: true}", ["shading.pixels", True, "'auto', 'all'", 100]),
     ],
 )
-def test_pixels_of_specular_light_that_cannot_be(scene, text, words):
-    with pytest.raises(InputError) as caught:
+def test_pixels_of_specular_light_that_cannot_be(scene, text, names):
+    with refused("config/scenes/x.yaml", *names) as caught:
         settings.load("x", "draft", scene(f"{GOOD}{text}\n"))
-    assert all(word in str(caught.value) for word in words), caught.value
     assert "constrained" not in str(caught.value)
 
 
@@ -76,63 +76,62 @@ def test_scene_over_preset_over_default(scene):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "names"),
     [
-        (GOOD + "capture: {veiws: 3}\n", ["x.yaml", "capture.veiws", "unknown key", "Did you mean `views`?", "Allowed here"]),
-        (GOOD + "capture: {Views: 3}\n", ["x.yaml", "capture.Views", "unknown key", "Did you mean `views`?"]),
-        (GOOD + "affines: {VIEWS: 3}\n", ["x.yaml", "affines.VIEWS", "unknown key", "Allowed here"]),
-        (GOOD + "colour: 3\n", ["colour", "unknown key", "capture"]),
+        (GOOD + "capture: {veiws: 3}\n", ["capture.veiws", "`views`", "samples, test_every, views, width"]),
+        (GOOD + "capture: {Views: 3}\n", ["capture.Views", "`views`"]),
+        (GOOD + "affines: {VIEWS: 3}\n", ["affines.VIEWS", "batch, epochs, iterations"]),
+        (GOOD + "colour: 3\n", ["colour", "affines, base, capture"]),
         (
             GOOD + "override: {window frame: {metallic: 0}}\n",
-            ["`override.window frame`", "Did you mean `overrides`, where materials"],
+            ["override.window frame", "`overrides`", "components"],
         ),
-        (GOOD + "overrides: {components: {specular: off}}\n", ["Did you mean `override`, where parts of the model"]),
-        (GOOD + "capture: {views: 0}\n", ["capture.views", "found 0", "at least 1"]),
+        (
+            GOOD + "overrides: {components: {specular: off}}\n",
+            ["overrides.components.specular", "`override`", "metallic"],
+        ),
+        (GOOD + "capture: {views: 0}\n", ["capture.views", 0, 1]),
         (GOOD + "capture: {dynamic_range: mdr}\n", ["capture.dynamic_range", "'mdr'", "'ldr' or 'hdr'"]),
-        ("source: {kind: builtin}\nprior: {kind: simulated, samples: 0}\n", ["prior.samples", "found 0"]),
+        ("source: {kind: builtin}\nprior: {kind: simulated, samples: 0}\n", ["prior.samples", 0, 1]),
         ("source: {kind: buildin}\nprior: {kind: simulated}\n", ["source.kind", "'buildin'", "builtin, mitsuba, folder"]),
-        ("source: {kind: builtin}\nprior: {samples: 30}\n", ["prior.samples", "found 30", "at most 16"]),
-        ("source: {kind: mitsuba}\nprior: {kind: simulated}\n", ["source.path", "missing"]),
-        (GOOD + "affines: {scale: {kind: prior}}\n", ["`affines.scale.kind`: unknown key", "lamp, mean_albedo, white_patch"]),
-        (GOOD + "affines: {scale: x}\n", ["`affines.scale`: found 'x'", "'found' or 'prior'; it may also be `key: value` pairs"]),
-        (GOOD + "affines: {scale: {mean_albedo: 3}}\n", ["`affines.scale.mean_albedo`: found 3", "at most 1"]),
-        ("source: {kind: mitsuba, path: 3}\nprior: {kind: simulated}\n", ["source.path", "found 3"]),
-        ("source: {kind: builtn}\nprior: {kind: simulated}\n", ["source.kind", "found 'builtn'", "Did you mean builtin?"]),
-        (f"{GOOD}affines: {{response: srg}}\n", ["affines.response", "found 'srg'", "Did you mean srgb?"]),
-        (f"{GOOD}affines: {{pixels: some}}\n", ["affines.pixels", "found 'some'", "'all' or a whole number of at least 100"]),
-        ("prior: {kind: simulated}\n", ["`source`: missing"]),
-        ("source: {kind: builtin\n", ["x.yaml", "line", "not valid YAML"]),
-        ("- a\n- b\n", ["found list", "key: value"]),
-        (GOOD + "capture: {views: 3, views: 5}\n", ["x.yaml, line 3", "`views` stands twice"]),
-        ("source: builtin\nprior: {kind: simulated}\n", ["`source`", "'builtin'", "{kind: ...}"]),
-        (GOOD + "metrics: {views: 0}\n", ["metrics.views", "found 0", "a whole number of at least 1"]),
-        (GOOD + "affines: {ridge: 0.1}\n", ["`affines.ridge`: unknown key. It was removed", "no effect"]),
-        (GOOD + "base: {predictions: 99}\n", ["`base: predictions` is 99", "`prior` makes 8"]),
-        (GOOD + "capture: {test_every: 1}\n", ["capture.test_every", "found 1", "2 and more"]),
+        ("source: {kind: builtin}\nprior: {samples: 30}\n", ["prior.samples", 30, 16]),
+        ("source: {kind: mitsuba}\nprior: {kind: simulated}\n", ["source.path", "config/scenes/kitchen.yaml"]),
+        (GOOD + "affines: {scale: {kind: prior}}\n", ["affines.scale.kind", "lamp, mean_albedo, white_patch"]),
+        (GOOD + "affines: {scale: x}\n", ["affines.scale", "'x'", "'found' or 'prior'", "key: value"]),
+        (GOOD + "affines: {scale: {mean_albedo: 3}}\n", ["affines.scale.mean_albedo", 3, 1]),
+        ("source: {kind: mitsuba, path: 3}\nprior: {kind: simulated}\n", ["source.path", 3]),
+        ("source: {kind: builtn}\nprior: {kind: simulated}\n", ["source.kind", "'builtn'", "builtin"]),
+        (f"{GOOD}affines: {{response: srg}}\n", ["affines.response", "'srg'", "srgb"]),
+        (f"{GOOD}affines: {{pixels: some}}\n", ["affines.pixels", "'some'", "'all'", 100]),
+        ("prior: {kind: simulated}\n", ["source", "config/scenes/kitchen.yaml"]),
+        ("source: {kind: builtin\n", ["line 2", "YAML"]),
+        ("- a\n- b\n", ["list", "key: value"]),
+        (GOOD + "capture: {views: 3, views: 5}\n", ["line 3", "`views`"]),
+        ("source: builtin\nprior: {kind: simulated}\n", ["source", "'builtin'", "source: {kind: ...}"]),
+        (GOOD + "metrics: {views: 0}\n", ["metrics.views", 0, 1]),
+        (GOOD + "affines: {ridge: 0.1}\n", ["affines.ridge"]),
+        (GOOD + "base: {predictions: 99}\n", ["base: predictions", 99, "`prior`", 8]),
+        (GOOD + "capture: {test_every: 1}\n", ["capture.test_every", 1, 0, 2]),
     ],
 )
-def test_errors_tell_what_to_do(scene, text, words):
+def test_errors_tell_what_to_do(scene, text, names):
     root = scene(text)
-    with pytest.raises(InputError) as caught:
+    with refused("config/scenes/x.yaml", *names):
         settings.load("x", "draft", root)
-    for word in words:
-        assert word in str(caught.value)
 
 
-@pytest.mark.parametrize(("name", "words"), [("Küche 1", ["'Küche 1'", "letters from a to z"]), ("studies", ["results/ uses"])])
-def test_scene_file_with_a_name_that_cannot_be(scene, name, words):
+@pytest.mark.parametrize(("name", "names"), [("Küche 1", ["'Küche 1'", "a to z"]), ("studies", ["'studies'", "results/"])])
+def test_scene_file_with_a_name_that_cannot_be(scene, name, names):
     root = scene(GOOD)
     (root / "config/scenes" / f"{name}.yaml").write_text(GOOD)
-    with pytest.raises(InputError) as caught:
+    with refused(f"config/scenes/{name}.yaml", *names):
         settings.load(name, "draft", root)
-    for word in [f"config/scenes/{name}.yaml", *words, "rename the file"]:
-        assert word.lower() in str(caught.value).lower()
 
 
 def test_scene_file_that_is_not_utf8(scene):
     root = scene(GOOD)
     (root / "config/scenes/x.yaml").write_bytes(GOOD.encode("utf-16"))
-    with pytest.raises(InputError, match="x.yaml: not UTF-8 text"):
+    with refused("x.yaml", "UTF-8"):
         settings.load("x", "draft", root)
 
 
@@ -160,14 +159,14 @@ def test_a_folder_with_scenes_of_its_own_uses_these_alone_with_the_presets_of_th
     paper = settings.read_yaml(repository / "config/quality/paper.yaml")
     assert settings.load("x", "paper", root).capture.samples == paper["capture"]["samples"] != 64
     assert [line.name for line in batch_table.read_table(root)] == ["x"]
-    with pytest.raises(InputError, match="config/scenes/kitchen.yaml: not found. Known scenes: x"):
+    with refused("config/scenes/kitchen.yaml", "x"):
         settings.load("kitchen", "draft", root)
 
 
 def test_a_scene_file_with_the_other_suffix_is_named(scene):
     root = scene(GOOD)
     (root / "config/scenes/x.yaml").rename(root / "config/scenes/room.yml")
-    with pytest.raises(InputError, match="room.yaml: not found. room.yml is there: rename it to room.yaml. Known"):
+    with refused("config/scenes/room.yaml", "room.yml"):
         settings.load("room", "draft", root)
 
 
@@ -182,7 +181,7 @@ def test_a_path_with_a_similar_name_beside_it_is_suggested(tmp_path):
 
 def test_unknown_scene_suggests(scene):
     root = scene(GOOD)
-    with pytest.raises(InputError, match="Did you mean scenes/x"):
+    with refused("config/scenes/xx.yaml", "scenes/x"):
         settings.load("xx", "draft", root)
 
 
@@ -203,9 +202,11 @@ def test_the_kitchen_can_be_relit_as_it_is_shipped(repository):
     assert plan == "kitchen" and {"dimmed", "evening", "vase", "lamp"} <= set(names)
 
 
-def test_bounds_are_words():
+def test_the_page_has_ranges_and_each_line_once():
     text = settings.reference_markdown()
-    assert "(at least 1, at most 64)" in text and "Ge(" not in text
+    assert "(1 to 64)" in text and "(> 0)" in text and "Ge(" not in text
+    lines = [line for line in text.splitlines() if line.startswith("| `")]
+    assert len(lines) == len(set(lines)) and "Also of `learned`: `seed`." in text
 
 
 def test_registry_is_ordered_and_its_settings_exist(repository):
@@ -230,7 +231,7 @@ def test_yaml_is_read_alike_with_and_without_libyaml(tmp_path, monkeypatch):
             found[-1].append(str(error.value))
     assert found[0] == found[1]
     assert found[0][0]["b"] == {"x": 1, "y": 3}
-    assert "key `x` stands twice" in found[0][1] and "nobody" in found[0][2]
+    assert not missing(found[0][1], "line 3", "`x`") and "nobody" in found[0][2]
 
 
 @pytest.mark.parametrize(
@@ -250,19 +251,18 @@ def test_a_forced_component_is_the_setting_of_its_own(scene, words, section, key
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "names"),
     [
-        ("override: {components: {environment: off}}\nemission: {environment: on}", "contradicts `emission: environment: on`"),
-        ("override: {components: {denoiser: on}}\nrender: {denoise: false}", "contradicts `render: denoise: False`"),
-        ("override: {components: {metallic: on}}", "override.components.metallic"),
-        ("override: {components: {gloss: off}}", "gloss"),
-        ("override: {components: {specular: maybe}}", "'auto', 'on' or 'off'"),
+        ("override: {components: {environment: off}}\nemission: {environment: on}", ["override", "emission: environment: on"]),
+        ("override: {components: {denoiser: on}}\nrender: {denoise: false}", ["override", "render: denoise: False"]),
+        ("override: {components: {metallic: on}}", ["override.components.metallic", "'on'", "'auto' or 'off'"]),
+        ("override: {components: {gloss: off}}", ["override.components.gloss", "specular"]),
+        ("override: {components: {specular: maybe}}", ["override.components.specular", "'maybe'", "'auto', 'on' or 'off'"]),
     ],
 )
-def test_an_override_that_cannot_be(scene, text, words):
-    with pytest.raises(InputError) as caught:
+def test_an_override_that_cannot_be(scene, text, names):
+    with refused("config/scenes/x.yaml", *names):
         settings.load("x", "draft", scene(f"{GOOD}{text}\n"))
-    assert words in str(caught.value), caught.value
 
 
 def test_limits_of_a_scene_hold_for_every_quality_and_raise_nothing(repository, tmp_path, monkeypatch):
@@ -275,26 +275,26 @@ def test_limits_of_a_scene_hold_for_every_quality_and_raise_nothing(repository, 
     (tmp_path / "config/scenes/t.yaml").write_text(text + "capture: {views: 30}\n")  # what the scene sets itself, holds
     assert settings.load("t", "paper", tmp_path).capture.views == 30
     (tmp_path / "config/scenes/t.yaml").write_text(text.replace("views: 20", "views: 0"))
-    with pytest.raises(InputError, match=r"`limits.views`: found 0"):
+    with refused("config/scenes/t.yaml", "limits.views", 0, 1):
         settings.load("t", "draft", tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("draft", "message"),
+    ("draft", "names"),
     [
-        ("point: draft\n", r"config/quality/draft.yaml: `point`: found 'draft'; needed is the name of a file next to it"),
-        ("point: nowhere\n", r"config/quality/draft.yaml: `point`: found 'nowhere'"),
-        ("point: [p01]\n", r"config/quality/draft.yaml: `point`: found \['p01'\]"),
-        ("capture: {veiws: 3}\n", r"config/quality/draft.yaml: `capture.veiws`: unknown key. Did you mean `views`?"),
-        ("point: p01\nmetrics: {veiws: 3}\n", r"config/quality/draft.yaml: `metrics.veiws`"),
+        ("point: draft\n", ["point", "'draft'", "p01"]),
+        ("point: nowhere\n", ["point", "'nowhere'", "p01"]),
+        ("point: [p01]\n", ["point", "['p01']"]),
+        ("capture: {veiws: 3}\n", ["capture.veiws", "`views`"]),
+        ("point: p01\nmetrics: {veiws: 3}\n", ["metrics.veiws", "`views`"]),
     ],
 )
-def test_mistakes_in_a_quality_are_blamed_on_its_file(tmp_path, draft, message):
+def test_mistakes_in_a_quality_are_blamed_on_its_file(tmp_path, draft, names):
     for part in ("scenes", "quality"):
         (tmp_path / "config" / part).mkdir(parents=True)
     (tmp_path / "config/scenes/t.yaml").write_text("source: {kind: builtin, scene: tiny}\nprior: {kind: simulated}\n")
     (tmp_path / "config/quality/draft.yaml").write_text(draft)
-    with pytest.raises(InputError, match=message):
+    with refused("config/quality/draft.yaml", *names):
         settings.load("t", "draft", tmp_path)
 
 
@@ -320,14 +320,12 @@ def test_a_quality_may_be_a_point_with_a_change_and_a_point_alone_is_known_by_it
 
 def test_a_bench_of_a_scene_that_is_not_there_says_so(tmp_path):
     (tmp_path / "config/scenes").mkdir(parents=True)
-    with pytest.raises(InputError, match=r"config/scenes/typo.yaml: not found"):
+    with refused("config/scenes/typo.yaml"):
         settings.load("typo--bench-p01-s0", "draft", tmp_path)
 
 
 def test_a_comparison_needs_two_names(repository):
-    with pytest.raises(
-        InputError, match="compare/kitchen: no rule makes this. It needs the names of two results, such as compare/kitchen,"
-    ):
+    with refused("compare/kitchen", "compare/kitchen,country-kitchen"):
         settings.refuse_target("compare/kitchen", [], repository)
 
 
@@ -336,18 +334,17 @@ def test_a_workflow_profile_that_is_not_there_is_refused(repository, tmp_path):
     for given in ("none", "default", "workflow/profiles/slurm-scenes", "workflow/profiles/slurm/config.yaml"):
         settings.refuse_profile(given, repository, repository)
     settings.refuse_profile(str(repository / "workflow/profiles/slurm"), tmp_path, repository)
-    with pytest.raises(InputError, match=r"slurm-scene: not found; .* Did you mean workflow/profiles/slurm-scenes\?"):
+    with refused("--workflow-profile workflow/profiles/slurm-scene", "workflow/profiles/slurm-scenes"):
         settings.refuse_profile("workflow/profiles/slurm-scene", repository, repository)
-    with pytest.raises(InputError) as caught:
+    with refused("--workflow-profile workflow/profiles/slurm", tmp_path, repository / "workflow/profiles/slurm-scenes"):
         settings.refuse_profile("workflow/profiles/slurm", tmp_path, repository)
-    assert f"counts from {tmp_path}" in str(caught.value) and f"{repository}/workflow/profiles/slurm-scenes" in str(caught.value)
 
 
 def test_a_name_that_nothing_is_scattered_by_is_refused():
     settings.refuse_scatter({"prior": 8}, ("prior",))
-    with pytest.raises(InputError, match="--set-scatter prior=0: needs a number of parts"):
+    with refused("--set-scatter prior=0", 1):
         settings.refuse_scatter({"prior": 0}, ("prior",))
-    with pytest.raises(InputError, match="--set-scatter piror: nothing is scattered by this name. Did you mean prior"):
+    with refused("--set-scatter piror", "prior"):
         settings.refuse_scatter({"piror": 8}, ("prior",))
 
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iif_core.errors import InputError
 from iif_core.light.emission.translucent import OPEN_RATIO, is_brighter_where_open
+from tests.errors import refused
 from tests.unit.transport_rooms import ROOM_MATERIALS, Room, quad
 
 SHARE = 0.35
@@ -107,7 +107,7 @@ def test_guides_show_the_sheet_itself(T):
 
 @pytest.mark.parametrize("share", [-0.1, 1.0, np.nan])
 def test_shares_out_of_range(T, share):
-    with pytest.raises(InputError, match="transmittance"):
+    with refused("transmittance"):
         sheets(T, share, (0.0, 1.0))
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from iif_core.errors import InputError
+from tests.errors import refused
 from tests.unit.transport_rooms import box, lambertian, quad
 
 
@@ -57,22 +57,22 @@ def test_far_from_the_origin_nothing_shadows_itself(T):
 
 def test_bad_input_is_named(T, room):
     square = quad((0, 0, 0), (1, 0, 0), (0, 1, 0))
-    with pytest.raises(InputError, match="no face of area"):
+    with refused("mesh", "1e-12", 1):
         T.build_geometry(np.zeros((3, 3)), [[0, 1, 2]], [0])
-    with pytest.raises(InputError, match="vertices 0 ... 9"):
+    with refused("0 ... 9", "0 ... 3"):
         T.build_geometry(square[0], [[0, 1, 9]], [0])
-    with pytest.raises(InputError, match="NaN"):
+    with refused("faces", "NaN"):
         T.build_geometry(np.full((4, 3), np.nan), square[1], [0, 0])
-    with pytest.raises(InputError, match="one id for each face"):
+    with refused("object_id", "(1,)", "(2,)"):
         T.build_geometry(*square, [0])
     geometry = T.build_geometry(*square, [0, 0])
-    with pytest.raises(InputError, match="never negative"):
+    with refused("emitter radiance", -1):
         T.Emitters(geometry, -np.ones((2, 3)))
-    with pytest.raises(InputError, match="side"):
+    with refused("emitter side", "(2,)"):
         T.Emitters(geometry, np.ones((2, 3)), [2, 0])
-    with pytest.raises(InputError, match="NaN"):
+    with refused("face_values", "NaN"):
         T.FaceMaterials(np.full((2, 5), np.nan))
-    with pytest.raises(InputError, match="roughness levels"):
+    with refused("roughness levels", "[0.5, 0.1]", "[0.02, 1]"):
         T.shading_caches(
             T.Scene(room.geometry, room.material, room.emitters),
             room.points,
@@ -81,11 +81,11 @@ def test_bad_input_is_named(T, room):
             [0.5, 0.1],
             T.PathOptions(1, 1, 0),
         )
-    with pytest.raises(InputError, match="samples=0"):
+    with refused("samples=0", "max_bounces=5"):
         room.render(T, 0, seed=0)
-    with pytest.raises(InputError, match="zero vector"):
+    with refused("directions"):
         T.render(T.Scene(room.geometry, room.material, room.emitters), [0, 0, 0], np.zeros((1, 3)), T.PathOptions(1, 1, 0))
-    with pytest.raises(InputError, match="emitter_of_face"):
+    with refused("emitter_of_face", "(40,)", "-1 ... 0"):
         T.transport_matrix(
             T.Scene(room.geometry, room.material, None),
             T.ShadingPoints(room.points, room.normals, room.wo, room.base_color, room.roughness, room.metallic),

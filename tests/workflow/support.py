@@ -27,6 +27,13 @@ def planned(result: subprocess.CompletedProcess) -> set[str]:
     return set(re.findall(r"^(\w+) +\d+ *$", table, re.M)) - {"scenes"}
 
 
+def error_of(result: subprocess.CompletedProcess) -> str:
+    """The last line of a run that failed, which is its one error, without `error: `."""
+    last = result.stderr.strip().splitlines()[-1]
+    assert result.returncode == 1 and last.startswith("error: ") and "Traceback" not in result.stderr, result.stderr[-3000:]
+    return last.removeprefix("error: ")
+
+
 def manifests(folder: Path) -> dict[str, str]:
     """Digest of every stage manifest but publish's, whose timings differ from run to run."""
     return {
@@ -37,13 +44,13 @@ def manifests(folder: Path) -> dict[str, str]:
 
 
 def treatment(case: str) -> str:
-    """The text that docs/reference/bad-input.md promises for a case."""
-    page = Path(__file__).resolve().parents[2] / "docs/reference/bad-input.md"
+    """The text that tests/unit/bad_input.md has for a case."""
+    page = Path(__file__).resolve().parents[1] / "unit/bad_input.md"
     for line in page.read_text().splitlines():
         match = re.fullmatch(r"\| (.+?) \| `(.+)` \|", line)
         if match and match[1] == case:
             return match[2]
-    raise AssertionError(f"docs/reference/bad-input.md has no row for {case!r}")
+    raise AssertionError(f"tests/unit/bad_input.md has no row for {case!r}")
 
 
 class Workflow:

@@ -7,9 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
-import pytest
 
-from iif_core.errors import InputError
+from tests.errors import named, refused
 from workflow.artifacts import StageReader
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.files import write_exr
@@ -67,13 +66,13 @@ def test_the_maps_of_a_finished_scene_are_maps(workflow):
             assert list(files) == views
             found, wanted = (read_map(of, quantity, view)[dark] for of in (layered, apart))
             assert dark.mean() > 0.5 and np.allclose(found, wanted, rtol=2e-3, atol=2e-3), (quantity, name)
-    with pytest.raises(InputError, match="the scene has no view 003"):
+    with refused("view 003", "000, 001, 002"):
         find(workflow.folder / "scenes/tiny/maps", "auto", views[:-1])
 
 
 def test_maps_that_are_not_there_stop_before_any_job(workflow):
-    assert "score/tiny: whose maps? Give their folder: --config maps=<folder>" in fails(workflow, "score/tiny")
-    assert "--config maps=nowhere: no such folder" in fails(workflow, "score/tiny", "--config", "maps=nowhere")
+    named(fails(workflow, "score/tiny"), "score/tiny", "--config maps=<folder>")
+    named(fails(workflow, "score/tiny", "--config", "maps=nowhere"), "--config maps=nowhere")
 
 
 def test_a_result_beside_itself_and_beside_another(workflow):
@@ -110,9 +109,9 @@ def test_a_result_beside_itself_and_beside_another(workflow):
 
 
 def test_results_that_are_not_there_stop_before_any_job(workflow):
-    assert "scenes/tinny.yaml: not found. Did you mean" in fails(workflow, "compare/tiny,tinny")
+    named(fails(workflow, "compare/tiny,tinny"), "config/scenes/tinny.yaml", "tiny")
     shutil.rmtree(workflow.folder / "results/tiny/affines")
-    assert "results/tiny: without affines, so there is no result to compare yet" in fails(workflow, "compare/tiny,tiny")
+    named(fails(workflow, "compare/tiny,tiny"), "results/tiny", "affines")
 
 
 def test_the_tiny_room_under_new_light(workflow):

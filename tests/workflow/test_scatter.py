@@ -8,6 +8,8 @@ import sys
 
 from support import manifests, planned
 
+from tests.errors import missing, named
+
 NOTHING = "Nothing to be done"
 PRIOR = "results/tiny/prior/manifest.json"
 
@@ -58,7 +60,7 @@ def test_a_part_makes_its_views_alone_and_goes_on_after_a_kill(workflow):
     assert whole.returncode == 0 and files(folder) == undisturbed and kept.stat().st_mtime_ns == before
     for text in ("0-of-2", "3/2", "x"):
         refused = alone(workflow, "--part", text)
-        assert refused.returncode == 1 and refused.stderr.startswith(f"error: --part {text}: not a part")
+        assert refused.returncode == 1 and refused.stderr.startswith(f"error: --part {text}: ")
 
 
 def test_a_prior_that_would_repeat_work_is_not_scattered(workflow):
@@ -67,9 +69,9 @@ def test_a_prior_that_would_repeat_work_is_not_scattered(workflow):
     dry = workflow.run(PRIOR, "--set-scatter", "prior=3", "-n")
     assert planned(dry) == {"prior"}, dry.stderr
     (line,) = [line for line in dry.stderr.splitlines() if "--set-scatter" in line and line.startswith("tiny:")]
-    assert "has no effect: prior retinex first gathers the light of all photographs" in line
+    named(line, "--set-scatter prior", "prior retinex")
     grouped = ("--groups", "prior=scene", "--group-components", "scene=1")
     path.write_text(path.read_text().replace("prior: {kind: retinex}", "prior: {kind: simulated, samples: 4}"))
     assert planned(workflow.run(PRIOR, "--set-scatter", "prior=3", "-n")) == {"prior", "prior_part"}
     dry = workflow.run(PRIOR, "--set-scatter", "prior=3", "-n", *grouped)
-    assert planned(dry) == {"prior"} and "use workflow/profiles/slurm" in dry.stderr
+    assert planned(dry) == {"prior"} and not missing(dry.stderr, "workflow/profiles/slurm")

@@ -303,7 +303,7 @@ def _page(
     facts = [
         ("maps", str(folder)),
         ("pixels that count", masks),
-        ("protocols", f"{protocols}. Every quantity has those of stage metrics"),
+        ("protocols", f"{protocols}. Each quantity has the protocols of stage metrics"),
         ("colour", "scores of albedo are of linear values; pictures below are shown in sRGB"),
     ]
     strips = [strip for view, own, truth in kept for strip in _strips(view, own, truth)]

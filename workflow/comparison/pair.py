@@ -232,7 +232,7 @@ def _page(a: Result, b: Result, parts: dict[str, list[Row]], strips: list[Strip]
     if not strips:
         warnings.append("No view of the one is at the place of a view of the other: there are no pictures to compare.")
     if a["segmentation"].fingerprint != b["segmentation"].fingerprint:
-        warnings.append("The objects were made differently; those of the same number and name stand side by side.")
+        warnings.append("The objects were made differently; objects of the same number and name are compared.")
     facts = [
         (
             name,

@@ -1,4 +1,4 @@
-"""What a scene requires (docs/method/evaluation.md#what-a-scene-requires): each function decides one component of the model.
+"""What a scene requires (docs/method/plan.md): each function decides one component of the model.
 
 There is one module for each part of the model, so that a new threshold for the light does not make segments anew.
 """

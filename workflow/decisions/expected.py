@@ -30,7 +30,7 @@ class Whole(NamedTuple):
 
 @lru_cache(None)
 def claims(path: Path = SHIPPED) -> dict[str, Any]:
-    """Return component -> `included` or `left_out` -> gain and shares (`docs/development/studies.md`)."""
+    """Return component -> `included` or `left_out` -> gain and shares (`lab/docs/studies.md`)."""
     return json.loads(path.read_text())
 
 

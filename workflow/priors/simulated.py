@@ -1,4 +1,4 @@
-"""Prior `simulated`: ground truth with simulated errors of a single-view diffusion model (docs/method/priors.md#simulated)."""
+"""Prior `simulated`: ground truth with simulated errors of a single-view diffusion model (lab/docs/simulated.md#simulated)."""
 
 from __future__ import annotations
 

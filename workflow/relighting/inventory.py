@@ -60,7 +60,7 @@ class Inventory:
         there = ", ".join(f"{lamp.emitter_id} ({self.name_of(lamp)})" for lamp in self.lamps[:8]) or "none"
         hint = did_you_mean(key, [self.names[o] for lamp in self.lamps for o in lamp.objects], "{!r}")
         what = f"object {key!r} does not shine" if key in self.names else f"there is no lamp {key!r}"
-        raise InputError(f"{where}: {what}.{hint} Lamps of this room: {there}; ids are those of emitters.parquet")
+        raise InputError(f"{where}: {what}.{hint} Lamps of this room: {there}; ids are in emitters.parquet")
 
     def check(self, entry: dict[str, Any]) -> None:
         """Check the lamps and objects that a dumped relighting names.

@@ -21,7 +21,7 @@ class Kind(NamedTuple):
 KINDS = (
     Kind("room.html", "the room to walk through, under other light", "any browser, offline"),
     Kind("scene.glb", "mesh, materials and lamps (glTF 2.0)", "Blender, three.js, Windows 3D Viewer"),
-    Kind("scene_unlit.glb", "the same with the room's light baked in (glTF 2.0, unlit)", "viewers without light of their own"),
+    Kind("scene_unlit.glb", "the same with the room's light baked in (glTF 2.0, unlit)", "viewers without lighting"),
     Kind("scene.usdc", "mesh, materials, lamps and cameras (USD)", "Houdini, Omniverse, Blender, Apple devices"),
     Kind("blender_import.py", "sets up mesh, lamps, cameras, photographs and response", "blender --python blender_import.py"),
     Kind("mitsuba/scene.xml", "the room for Mitsuba 3, with up to 16 cameras", "mitsuba -m scalar_rgb scene.xml"),

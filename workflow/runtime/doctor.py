@@ -97,7 +97,7 @@ def check_packages(pins: Path = PINS) -> Iterator[Finding]:
     if missing:
         yield Finding("FAIL", "packages", "missing " + ", ".join(missing), INSTALL)
     if differing:
-        yield Finding("warn", "packages", ", ".join(differing), f"results may differ from those of the lock: {INSTALL}")
+        yield Finding("warn", "packages", ", ".join(differing), f"results may differ from the lock's: {INSTALL}")
     if not missing and not differing:
         yield Finding("ok", "packages", f"all {count} of {pins.name} are installed as pinned")
 

@@ -1,4 +1,4 @@
-"""A room under new light: what shines, in terms of its source and of its recovery (docs/method/evaluation.md#relighting).
+"""A room under new light: what shines, in terms of its source and of its recovery (lab/docs/evaluation.md#relighting).
 
 The lamps of a source are its emitting objects; those of a recovery are the faces that were found to emit, assigned to the former.
 """

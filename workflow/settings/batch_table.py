@@ -171,7 +171,7 @@ def _problem_of_name(line: Line, earlier: dict[str, Line]) -> str:
     if not name:
         return where + "empty; every scene needs a name"
     if not _NAME.fullmatch(name) or "--" in name or fault_of_name(name):
-        return where + f"found {shown(name)}; allowed are letters, digits, _ and single -, the first no sign"
+        return where + f"found {shown(name)}; use letters, digits, _ and single -, starting with a letter or digit"
     if name in RESERVED:
         return where + f"found {name!r}, which results/ uses otherwise; choose another name"
     if name in earlier:

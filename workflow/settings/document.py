@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any, get_origin
 
-from workflow.settings.explain import BOUNDS
+from pydantic.fields import FieldInfo
+
 from workflow.settings.relight import RelightPlan
 from workflow.settings.scene import UNIONS, SceneSettings, section_in
 from workflow.settings.section import Section
@@ -26,12 +27,25 @@ def _schema(model: type[Section]) -> str:
     return json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}, indent=1) + "\n"
 
 
-_BOUNDS = {**BOUNDS, "min_length": "at least"}
+_SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<", "min_length": "≥"}
 
 
-def _bound(rule: Any) -> str:
-    """Return `at least 1` for pydantic's `Ge(ge=1)`."""
-    return ", ".join(f"{words} {getattr(rule, name)}" for name, words in _BOUNDS.items() if hasattr(rule, name))
+def _range(rules: list[Any]) -> str:
+    """Return `1 to 64`, `≥ 1` or the like for pydantic's bounds of a value; nothing where there are none."""
+    bounds = {name: getattr(rule, name) for rule in rules for name in _SIGNS if hasattr(rule, name)}
+    if bounds.keys() == {"ge", "le"}:
+        return f"{bounds['ge']} to {bounds['le']}"
+    return ", ".join(f"{sign} {bounds[name]}" for name, sign in _SIGNS.items() if name in bounds)
+
+
+def _row(key: str, field: FieldInfo, default: str) -> str:
+    """Return the line of a key: choices are named where its description does not name them, then the range."""
+    text = " ".join((field.description or "").split())
+    choices = getattr(field.annotation, "__args__", ())
+    if choices and all(isinstance(v, str) for v in choices) and not all(f"`{v}`" in text for v in choices):
+        text += f" One of {', '.join(f'`{v}`' for v in choices)}."
+    limits = _range(field.metadata)
+    return f"| `{key}` | {default} | {text}{f' ({limits})' if limits else ''} |"
 
 
 def _of_many(annotation: Any) -> str:
@@ -43,8 +57,10 @@ def reference_markdown() -> str:
     """Return the settings as a page: key, default, allowed values, meaning (docs/reference/settings.md)."""
     lines = ["# Settings", "", "Made from `workflow/settings/` by `python -m workflow.settings`; do not edit.", ""]
 
-    def rows(model: type[Section], prefix: str) -> None:
-        lines.extend(["| key | default | meaning |", "|---|---|---|"])
+    def rows(model: type[Section], prefix: str, kind: str = "", known: dict[str, str] | None = None) -> None:
+        """Add the table of a section; a line that an earlier kind has (`known`: line -> kind) is named and not repeated."""
+        table: list[str] = []
+        repeated: dict[str, list[str]] = {}
         nested_rows: list[tuple[str, type[Section]]] = []
         for name, field in model.model_fields.items():
             if name == "kind":
@@ -56,21 +72,27 @@ def reference_markdown() -> str:
                 default = "none" if field.get_default() is None else "see below"
             else:
                 default = "required" if field.is_required() else f"`{field.get_default(call_default_factory=True)}`"
-            text = " ".join((field.description or "").split())
-            bounds = ", ".join(filter(None, map(_bound, field.metadata)))
-            literal = getattr(field.annotation, "__args__", ())
-            if literal and all(isinstance(v, str) for v in literal):
-                text += f" One of {', '.join(f'`{v}`' for v in literal)}."
-            lines.append(f"| `{prefix}{name}` | {default} | {text}{f' ({bounds})' if bounds else ''} |")
-        lines.append("")
+            line = _row(f"{prefix}{name}", field, default)
+            if known is not None and line in known:
+                repeated.setdefault(known[line], []).append(f"`{name}`")
+            else:
+                table.append(line)
+                if known is not None:
+                    known[line] = kind
+        if table:
+            lines.extend(["| key | default | meaning |", "|---|---|---|", *table, ""])
+        if repeated:
+            where = "; ".join(f"of `{first}`: {', '.join(names)}" for first, names in repeated.items())
+            lines.extend([f"{'Also' if table else 'Keys'} {where}.", ""])
         for inner, section in nested_rows:
             rows(section, inner)
 
     for name, field in SceneSettings.model_fields.items():
         if name in UNIONS:
+            known: dict[str, str] = {}
             for kind, model in UNIONS[name].items():
                 lines.extend([f"## `{name}: {{kind: {kind}}}`", "", " ".join((model.__doc__ or "").split()), ""])
-                rows(model, f"{name}.")
+                rows(model, f"{name}.", kind, known)
         elif isinstance(section := section_in(field.annotation), type) and issubclass(section, Section):
             many = _of_many(field.annotation)
             what = {"[]": " (a list)", ".<name>": " (by name)"}.get(many, "")

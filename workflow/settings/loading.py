@@ -51,8 +51,8 @@ def scene_file(scene: str, root: Path = Path(".")) -> Path:
     if scene_path(scene, root).is_file():
         if not re.fullmatch(SCENE_NAME, scene):
             raise InputError(
-                f"config/scenes/{scene}.yaml: a scene cannot be called {scene!r}; allowed are letters from a to z, digits, _"
-                " and -, the first no sign. Rename the file"
+                f"config/scenes/{scene}.yaml: a scene cannot be called {scene!r}; use letters from a to z, digits,"
+                " _ and -, starting with a letter or digit. Rename the file"
             )
         if scene in RESERVED:
             raise InputError(f"config/scenes/{scene}.yaml: results/ uses {scene!r} otherwise; rename the file")

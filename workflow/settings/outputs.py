@@ -32,7 +32,7 @@ class Metrics(Section):
 
 
 class Relit(Section):
-    """Scores of pictures under new light, made by studies with `scores: relit_scores` (docs/method/evaluation.md#relighting)."""
+    """Scores of pictures under new light, made by studies with `scores: relit_scores` (lab/docs/evaluation.md#relighting)."""
 
     views: int = Field(3, ge=1)
     """Views that are rendered under each light, spread evenly over all."""

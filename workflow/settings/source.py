@@ -19,7 +19,7 @@ class BuiltinSource(Section):
         "kitchen", "matte", "tiny", "tiny-gloss", "tiny-black-metal", "tiny-white", "tiny-lamp",
         "sky", "sun", "blinds", "curtains", "door", "lamps", "gloss", "white", "single", "evening",
     ] = "kitchen"  # fmt: skip
-    """Which room (docs/development/rooms.md): `kitchen` is furnished, `matte` the same without gloss and metal, `tiny` a few
+    """Which room (lab/docs/rooms.md): `kitchen` is furnished, `matte` the same without gloss and metal, `tiny` a few
     boxes."""
     quarterings: int = Field(0, ge=0, le=4)
     """How often every face of its mesh is split into four. The room stays the same; a scan is finer, and costs more."""

@@ -1,4 +1,4 @@
-"""Studies: tables of variants (settings) x scenes x seeds, run by the ordinary rules (docs/development/studies.md).
+"""Studies: tables of variants (settings) x scenes x seeds, run by the ordinary rules (lab/docs/studies.md).
 
 A *derived scene* `<scene>--<study>-<variant>-s<seed>` has the settings of the scene's own file, over them its entry in
 `config/studies/scenes.yaml`, over these `common` of the study and the settings of the variant, and `prior.seed: <seed>`.
@@ -94,7 +94,7 @@ class Design(Section):
     factors: dict[str, list[Any]] = Field(min_length=1)
     """Setting, or settings joined by ` + `, -> its levels, from cheap to dear."""
     trajectories: Literal[0] | Annotated[int, Field(ge=2)] = 0
-    """The first runs are this number of trajectories of Morris (docs/development/studies.md): the page then has the effect of
+    """The first runs are this number of trajectories of Morris (lab/docs/studies.md): the page then has the effect of
     each factor."""
     runs: list[str] = Field(min_length=1)
     """In the order of the trajectories; a run that is there twice is one variant."""
@@ -222,7 +222,7 @@ def load_study(name: str, root: Path = Path(".")) -> Study:
     if name not in names:
         raise InputError(
             f"{path}: not found.{did_you_mean(name, names)} Known studies: {', '.join(names) or 'none'}; benchmarks"
-            " of kernels: hashgrid, base_cost (docs/development/studies.md)."
+            " of kernels: hashgrid, base_cost (lab/docs/studies.md)."
         )
     if not re.fullmatch(STUDY, name):
         raise InputError(f"{path}: name of a study {name!r}: allowed are lower-case letters, digits and _, a letter first")
@@ -251,7 +251,7 @@ def _load_study(path: Path, file: Path, root: Path, _stamp: int) -> Study:
     for name in variants:
         if not _VARIANT.fullmatch(name):
             raise InputError(
-                f"{path}: `variants`: found the name {name!r}; allowed are letters, digits, _ and -, the first no sign"
+                f"{path}: `variants`: found the name {name!r}; use letters, digits, _ and -, starting with a letter or digit"
             )
     for name in study.paper:
         if name not in variants:
@@ -334,7 +334,7 @@ def _design(design: Design, path: Path, others: dict[str, Variant]) -> dict[str,
     if len(design.runs) < design.trajectories * whole:
         raise InputError(
             f"{path}: `design.trajectories`: found {design.trajectories}, which are {design.trajectories * whole} runs;"
-            f" there are {len(design.runs)}. docs/development/studies.md says what makes them"
+            f" there are {len(design.runs)}. lab/docs/studies.md says what makes them"
         )
     return out
 
@@ -358,7 +358,7 @@ def _check_trajectories(design: Design, whole: int, path: Path) -> None:
         ):
             raise InputError(
                 f"{path}: `design.runs`: those from {one[0]!r} on are no trajectory, in which each step changes one factor by"
-                f" two levels and each factor changes once. docs/development/studies.md says what makes them"
+                f" two levels and each factor changes once. lab/docs/studies.md says what makes them"
             )
 
 
@@ -371,7 +371,7 @@ def scene_overrides(root: Path = Path(".")) -> dict[str, dict[str, Any]]:
     """Return scene -> settings that every study uses for it; an entry with a `source` needs no scene of that name."""
     path = scenes_path(root)
     if not path.is_file():
-        raise InputError(f"{SCENES}: not found; it lists the scenes of the studies (docs/development/studies.md)")
+        raise InputError(f"{SCENES}: not found; it lists the scenes of the studies (lab/docs/studies.md)")
     document = read_yaml(path)
     known = scene_names(root)
     for scene, overrides in document.items():

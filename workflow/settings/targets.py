@@ -85,7 +85,7 @@ def _meant(target: str, scenes: list[str], rules: list[str], root: Path) -> str:
     if parts[0] in FOLDERS and len(parts) > 1:
         return did_you_mean(parts[-1], scenes, parts[0] + "/{}") or did_you_mean(parts[1], scenes, parts[0] + "/{}")
     if parts[:2] == ("results", "studies"):
-        return " Studies have their own Snakefile, see docs/development/studies.md."
+        return " Studies have their own Snakefile, see lab/docs/studies.md."
     if parts[0] == "results" and len(parts) > 2:
         stages = [f"results/{parts[1]}/{stage}/manifest.json" for stage in STAGES if stage != "publish"]
         same = [path for path in stages if Path(path).parts[2] == parts[2]]

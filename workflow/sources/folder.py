@@ -312,7 +312,7 @@ class _Capture:
             )
         for kind, names in found.items():
             more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-            what = "are not used" if kind == "black" else "say no more than that their surface is bright"
+            what = "are not used" if kind == "black" else "only show that their surface is bright"
             self.notes.append(
                 f"WARNING {len(names)} of {count} photographs are {kind} all over ({', '.join(names[:5])}{more}) and {what}:"
                 " check their exposure"
@@ -330,7 +330,7 @@ class _Capture:
         warning = self.alignment.edge_warning(tolerance)
         better = self._edge_advice() if warning and not self.alignment.ratios else ""
         if better:
-            message = f"{path}: photographs and mesh do not belong together as read: {better}. To go on anyway:"
+            message = f"{path}: photographs and mesh do not belong together as read: {better}. To continue anyway:"
             alignment.raise_or_note(f"{message} `source.alignment: warn`", self.source.alignment, self.notes)
         alignment.raise_or_note(warning, "warn", self.notes)
 

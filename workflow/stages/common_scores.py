@@ -1,5 +1,5 @@
 """Stage common_scores: scores of the result at views that all variants of a study share, whatever photographs each was made from
-(docs/method/evaluation.md#views-that-variants-share)."""
+(lab/docs/evaluation.md#views-that-variants-share)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """Stage relit_scores: the recovered scene under new light, scored against its source under the same light
-(docs/method/evaluation.md#relighting)."""
+(lab/docs/evaluation.md#relighting)."""
 
 from __future__ import annotations
 

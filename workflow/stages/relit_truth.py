@@ -1,4 +1,4 @@
-"""Stage relit_truth: the source of a scene with truth, rendered under new light (docs/method/evaluation.md#relighting)."""
+"""Stage relit_truth: the source of a scene with truth, rendered under new light (lab/docs/evaluation.md#relighting)."""
 
 from __future__ import annotations
 

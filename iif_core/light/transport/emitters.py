@@ -65,7 +65,7 @@ class Emitters:
         if side.shape != (faces,) or not np.isin(side, (-1, 0, 1)).all():
             raise InputError(f"emitter side has shape {side.shape}; expected ({faces},) of -1, 0 or +1")
         if radiance.min() < 0:
-            raise InputError("emitter radiance is negative somewhere; radiance is never negative")
+            raise InputError(f"emitter radiance is {radiance.min():g} somewhere; radiance is never negative")
 
         # -------- how often each face and texel is drawn --------
         # Area x mean radiance is the power of a face up to the factor pi.

@@ -1,5 +1,5 @@
 """The material fit as published: stochastic gradient descent with one step size on the clamped loss of all pixels
-(docs/development/published.md#materials).
+(lab/docs/published.md#materials).
 
 It shares no code with the solvers of this project but the response of the camera, so that it can judge them.
 """

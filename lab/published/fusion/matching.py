@@ -1,4 +1,4 @@
-"""Affine maps that minimise the paper's loss for a given selection (docs/method/fusion.md#distribution, Eqs. F.34, F.35).
+"""Affine maps that minimise the paper's loss for a given selection (lab/docs/published.md#distribution, Eqs. F.34, F.35).
 
 Each step lowers the loss for the reference scale b_ref of the sweep, which is computed again every sweep. Neither its derivative
 (docs/method/numerics.md#median-subgradient) nor clamps are followed, so the loss may rise a little between sweeps.

@@ -1,4 +1,4 @@
-"""The published loss over all pixels, which judges every solver (docs/method/fusion.md#judge): float64, one view at a time."""
+"""The published loss over all pixels, which judges every solver (lab/docs/published.md#judge): float64, one view at a time."""
 
 from __future__ import annotations
 

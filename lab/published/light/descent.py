@@ -1,5 +1,5 @@
 """Emission as the published method finds it: a radiance for every bright triangle, by gradient descent on freshly traced pixels
-(docs/development/published.md#emission).
+(lab/docs/published.md#emission).
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Emission by stochastic gradient descent on traced pixels, the paper's kind of optimiser, as a twin of `direct`
-(docs/method/light.md#stochastic-gradient-descent, Eq. L.49, L.50).
+(lab/docs/published.md#emission-by-descent, Eq. L.49, L.50).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Light transport as the published method has it: one bounce, then the radiance cache (docs/development/published.md).
+"""Light transport as the published method has it: one bounce, then the radiance cache (lab/docs/published.md).
 
 A path ends at the second surface that it meets: at an emitter, in the cache, or in the dark. Emitters reflect, too.
 """

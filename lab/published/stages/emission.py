@@ -1,5 +1,5 @@
 """Stage emission as published: every bright triangle is an emitter, and a descent on fresh paths finds its radiance
-(docs/development/published.md#emission).
+(lab/docs/published.md#emission).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Stage shading as published: light of one bounce at every pixel, lobe by lobe (docs/development/published.md#shading)."""
+"""Stage shading as published: light of one bounce at every pixel, lobe by lobe (lab/docs/published.md#shading)."""
 
 from __future__ import annotations
 

@@ -463,7 +463,7 @@ class Alignment:
         return (
             f"{path}: mesh and {self.what} disagree (median relative difference {found}, tolerance {tolerance:.0%})."
             f" {better or 'No usual convention fits: check that mesh, poses and depth belong together'}."
-            " To go on anyway: `source.alignment: warn`"
+            " To continue anyway: `source.alignment: warn`"
         )
 
 

@@ -387,8 +387,8 @@ def _unique_names(path: Path, entries: list[dict[str, Any]]) -> None:
             )
         if _name(other) != name:
             raise InputError(
-                f"{path}: views {_name(other)!r} and {name!r} are one where capital letters do not count; rename one of the"
-                " photographs"
+                f"{path}: views {_name(other)!r} and {name!r} differ only in capital letters, which some disks ignore; rename"
+                " one of the photographs"
             )
         raise InputError(
             f"{path}: {other['file_path']!r} and {entry['file_path']!r} would both be view {name!r}; file names without"

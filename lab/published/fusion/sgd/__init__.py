@@ -1,1 +1,1 @@
-"""The paper's optimiser (docs/method/fusion.md#sgd): `solve.solve_sgd`."""
+"""The paper's optimiser (lab/docs/published.md#sgd): `solve.solve_sgd`."""

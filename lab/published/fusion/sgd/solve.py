@@ -1,6 +1,6 @@
 """The paper's optimiser: stochastic gradient descent on texture, affine maps and selection together (Eq. F.16).
 
-Every choice of the published behaviour that is numerically fragile is an option: docs/method/fusion.md#schedules compares the
+Every choice of the published behaviour that is numerically fragile is an option: lab/docs/published.md#schedules compares the
 presets `safe` and `paper`. The same problem, options and seed give the same bytes for any number of threads. All predictions stay
 in memory (in half precision if they come so), since a batch draws from every view.
 """
