@@ -1,8 +1,36 @@
 """What the laboratory adds to the product, by name (workflow/plugins.py)."""
 
-from __future__ import annotations
+# ----------------------------------------------------------------------- rooms with ground truth, and what needs it
 
-KINDS: dict[str, dict[str, tuple[str, str]]] = {}
+KINDS = {
+    "source": {
+        "builtin": ("lab.sources.builtin", "lab.settings.source:BuiltinSource"),
+        "mitsuba": ("lab.sources.mitsuba", "lab.settings.source:MitsubaSource"),
+    },
+    "prior": {"simulated": ("lab.simulated.prior", "lab.settings.prior:SimulatedPrior")},
+}
+ADDED = {
+    "relit_truth": {
+        "place": "lab.relit.truth",
+        "upstream": ("capture",),
+        "settings": ("source", "relit", "seed"),
+        "reads_raw": True,
+        "files": ("lab.relit.sources",),
+    },
+    "relit_scores": {
+        "place": "lab.relit.scores",
+        "upstream": ("capture", "segmentation", "base", "emission", "second_look", "affines", "relit_truth"),
+        "settings": ("relit", "seed"),
+    },
+}
+SIZES = {"builtin": "lab.work:faces_of_room", "mitsuba": "lab.work:faces_of_files"}
+COSTS = {
+    "builtin": "lab.work:rendered",
+    "mitsuba": "lab.work:rendered",
+    "relit_truth": "lab.work:relit_truth",
+    "relit_scores": "lab.work:relit_scores",
+}
+SCENES = "lab/config/scenes"
 
 # ------------------------------------------------------------------------------ the published method and baselines
 
@@ -11,6 +39,6 @@ SECTIONS = {
     "emission": "lab.settings.methods:Emission",
     "shading": "lab.settings.methods:Shading",
     "affines": "lab.settings.methods:Affines",
-    "scene": "lab.settings.scene:SceneSettings",
+    "scene": "lab.settings.scene:LabScene",
 }
 STAGES = {stage: f"lab.methods:{stage}" for stage in ("plan", "base", "emission", "shading", "second_look", "affines")}

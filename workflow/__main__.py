@@ -1,10 +1,9 @@
 """`python -m workflow <stage> <scene>` runs one stage: the rules call it, and so does a person with a debugger.
 
 `python -m workflow status [scene ...]` says where scenes stand, `verify [scene ...]` checks files against their manifests,
-`upgrade [scene ...]` brings manifests of an earlier version up to date, `batch` collects what jobs have left so far,
-`relit <scene>` copies pictures of relightings to relight/, `bench <scene>` shows what three points of speed and accuracy did in
-a room, `planned <scene>` what a room was found to require, `compare <a> <b>` puts two results side by side,
-`score <scene> <folder>` scores anyone's maps, and `lpips_vgg` fetches weights.
+`batch` collects what jobs have left so far, `relit <scene>` copies pictures of relightings to relight/, `bench <scene>` shows
+what three points of speed and accuracy did in a room, `planned <scene>` what a room was found to require, `compare <a> <b>` puts
+two results side by side, `score <scene> <folder>` scores anyone's maps, and `lpips_vgg` fetches weights.
 """
 
 from __future__ import annotations
@@ -74,52 +73,27 @@ def _arguments() -> argparse.Namespace:
     status.add_argument("--json", action="store_true", help="one JSON object for each scene, each on a line")
     verify = commands.add_parser("verify")
     verify.add_argument("scenes", nargs="*")
-    upgrade = commands.add_parser("upgrade")
-    upgrade.add_argument("scenes", nargs="*")
     return parser.parse_args()
-
-
-def _not_here(scenes: list[str], what: str) -> bool:
-    """Say of a scene that nothing of it is here, and return whether there is one."""
-    from workflow.artifacts.verify import with_artefacts
-    from workflow.settings.names import did_you_mean
-
-    known = with_artefacts()
-    for scene in scenes:
-        if scene not in known:
-            print(
-                f"error: {scene}: neither results/{scene} nor scenes/{scene} holds anything to {what}."
-                f"{did_you_mean(scene, known)} What is here: {', '.join(known) or 'nothing'}.",
-                file=sys.stderr,
-            )
-            return True
-    return False
-
-
-def _upgrade(scenes: list[str]) -> int:
-    from workflow.artifacts.upgrade import upgrade
-
-    if _not_here(scenes, "upgrade"):
-        return 1
-    done = []
-    for upgraded, line in upgrade(Path("results"), scenes or None):
-        done.append(upgraded)
-        print(line, flush=True)
-    print(f"{sum(done)} manifests upgraded, {len(done) - sum(done)} left as they are" if done else "nothing to upgrade")
-    return 0 if all(done) else 1
 
 
 def _verify(scenes: list[str]) -> int:
     from workflow.artifacts.verify import damaged, with_artefacts
     from workflow.runtime.attempts import written_out
+    from workflow.settings.names import did_you_mean
 
-    if _not_here(scenes, "verify"):
+    known = with_artefacts()
+    if absent := next((scene for scene in scenes if scene not in known), None):
+        print(
+            f"error: {absent}: neither results/{absent} nor scenes/{absent} holds anything to verify."
+            f"{did_you_mean(absent, known)} What is here: {', '.join(known) or 'nothing'}.",
+            file=sys.stderr,
+        )
         return 1
     problems = list(damaged(Path("."), scenes or None))
     for line in problems:
         print(written_out(line))
     nothing = "nothing to compare: no artefacts below results/ and scenes/"
-    sound = "all artefacts are as they were written" if with_artefacts() else nothing
+    sound = "all artefacts are as they were written" if known else nothing
     print(f"{len(problems)} damaged" if problems else sound)
     return 1 if problems else 0
 
@@ -218,8 +192,6 @@ def main() -> int:
         return _status(arguments.scenes, arguments.quality, arguments.json)
     if arguments.command == "verify":
         return _verify(arguments.scenes)
-    if arguments.command == "upgrade":
-        return _upgrade(arguments.scenes)
     from workflow.runtime import native
 
     try:  # before NumPy is imported: a BLAS that has started keeps its threads

@@ -8,6 +8,9 @@ holds nothing but names, so that it imports nothing, and defines any of
     STAGES   stage -> function of the dumped settings -> name of the module whose `run(job)` takes the stage's place, or None
     READS    stage -> dotted settings that such a module reads in addition to those in `workflow/registry.py`
     ADDED    stage that is made on demand -> the arguments of its `Stage`
+    SIZES    kind of source that is rendered -> function of its settings and of the faces of its mesh files -> faces
+    COSTS    such a kind, or an added stage -> function of settings and size -> kind and counts (workflow/costs/work.py)
+    SCENES   folder of the checkout with further scene files
 
 Classes and functions are written `package.module:name`. The settings of the product read the classes while they are imported
 themselves. So a module that holds such classes lies in a package whose `__init__` imports `workflow.settings`; it imports modules
@@ -18,6 +21,7 @@ from __future__ import annotations
 
 import importlib
 import os
+from collections.abc import Callable
 from functools import lru_cache, reduce
 from operator import or_
 from pathlib import Path
@@ -63,6 +67,12 @@ def _load(name: str) -> Any:
     return getattr(importlib.import_module(module), attribute)
 
 
+def function(table: str, name: str) -> Callable[..., Any] | None:
+    """Return the function that a plug-in has in a table under a name; None if there is none."""
+    found = [value for key, value in _entries(table) if key == name]
+    return _load(found[-1]) if found else None
+
+
 def union(section: str, *own: type) -> Any:
     """Return the union of the classes of settings of a section: the product's, and those of the kinds that plug-ins add."""
     added = [_load(settings) for name, kinds in _entries("KINDS") if name == section for _, settings in kinds.values()]
@@ -93,6 +103,11 @@ def replacement(stage: str, document: dict[str, Any]) -> str | None:
 def reads(stage: str) -> tuple[str, ...]:
     """Return the dotted settings that a module in the place of a stage reads in addition to those of the stage."""
     return tuple(key for name, keys in _entries("READS") if name == stage for key in keys)
+
+
+def scene_folders() -> list[str]:
+    """Return the folders of the checkout, relative to it, in which plug-ins have scene files."""
+    return [module.SCENES for module in modules() if hasattr(module, "SCENES")]
 
 
 def added_stages() -> dict[str, dict[str, Any]]:

@@ -132,20 +132,6 @@ STAGES: dict[str, Stage] = {
             on_demand=True,
             shared=("capture", "segmentation"),
         ),
-        Stage(
-            "relit_truth",
-            ("capture",),
-            ("source", "relit", "seed"),
-            reads_raw=True,
-            on_demand=True,
-            files=("workflow.sources.relit",),
-        ),
-        Stage(
-            "relit_scores",
-            ("capture", "segmentation", "base", "emission", "second_look", "affines", "relit_truth"),
-            ("relit", "seed"),
-            on_demand=True,
-        ),
         Stage("unwrap", ("capture", "segmentation", "base", "emission"), ("export.max_faces_glb", "export.texture_size")),
         Stage("export", ("capture", "segmentation", "base", "emission", "second_look", "affines", "unwrap"), ("export",)),
         Stage(

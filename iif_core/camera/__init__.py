@@ -1,1 +1,1 @@
-"""Cameras: projection, lens distortion, registration, response, exposure and gains, simulated photographs."""
+"""Cameras: projection, lens distortion, registration, response, exposure and gains."""

@@ -1,1 +1,1 @@
-"""Material priors as functions of arrays: simulated, retinex, and inputs and hypotheses of the learned one."""
+"""Material priors as functions of arrays: retinex, and inputs and hypotheses of the learned one."""

@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
+import lab  # noqa: F401  for the sources of the laboratory
 from tests.unit import own_scene as own
 from tests.workflow.prepared import prepare
 from tests.workflow.support import TINY

@@ -67,7 +67,7 @@ def kitchen() -> dict[str, Work]:
     from iif_core.light.transport.render import render
     from iif_core.light.transport.scene import EmitterColumns, PathOptions, Scene, ShadingPoints
     from iif_core.light.transport.shading import shading_caches
-    from workflow.sources import rooms
+    from lab import rooms
 
     room = rooms.build("kitchen")
     geometry = build_geometry(room.vertices, room.faces, room.object_id)

@@ -25,7 +25,7 @@ import numpy as np
 import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
+import lab  # noqa: F401  for the sources of the laboratory
 from iif_core.fitting import object_levels
 from iif_core.fitting.object_levels import ObjectLevels, compare_levels
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
+import lab  # noqa: F401  for the sources of the laboratory
 from workflow.costs.size import size_of_capture
 from workflow.registry import STAGES
 from workflow.runtime import forecast, native

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 import numpy as np
+
+import lab  # noqa: F401  for the sources of the laboratory
 
 ROWS, PAGE = Path("lab/notebook/data/object_intervals.json"), Path("lab/notebook/intervals.md")
 

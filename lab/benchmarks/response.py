@@ -24,9 +24,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from iif_core.camera.calibration.choice import CANDIDATES, calibrate_response
 from iif_core.camera.overlap import PatchRows, join_rows, patch_edge, patch_numbers, patch_rows
 from iif_core.camera.response import Response, response
-from iif_core.camera.simulation import expose, response_curve
 from iif_core.surface.cells import grid_origin
 from iif_core.surface.triangles import face_geometry
+from lab.simulated.photographs import expose, response_curve
 from workflow.artifacts import StageReader
 from workflow.scene.normal_form import CaptureReader
 

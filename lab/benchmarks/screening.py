@@ -38,7 +38,7 @@ import numpy as np
 import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
+import lab  # noqa: F401  for the sources of the laboratory
 from workflow.artifacts.store import StageReader, material_maps
 from workflow.runtime.fingerprint import import_closure
 from workflow.scene.normal_form import CaptureReader

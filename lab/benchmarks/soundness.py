@@ -39,9 +39,10 @@ def build(root: Path, scenes: int) -> tuple[int, list[tuple[str, str]]]:
                 path = root / scene / stage.name / f"maps/{file:03d}.exr"
                 path.parent.mkdir(exist_ok=True)
                 path.write_bytes(b"x" * file)  # without the flush of `StageWriter.bytes`: this is not what is measured
-                writer.files[f"maps/{file:03d}.exr"] = {"sha256": sha256_of(path), "bytes": file, "kind": "exr"}
+                digest = writer.stamps.of(path)
+                writer.files[f"maps/{file:03d}.exr"] = {"sha256": digest, "bytes": file, "kind": "exr"}
             writer.finish()
-            stamps.stamp_stage(root, scene, stage.name)
+            writer.stamps.save(stamps.place(root, scene, stage.name))
             count += FILES + 1
             made.append((scene, stage.name))
     return count, made

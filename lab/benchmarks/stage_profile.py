@@ -30,7 +30,7 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
+import lab  # noqa: F401  for the sources of the laboratory
 from workflow.registry import STAGES
 from workflow.runtime import native
 

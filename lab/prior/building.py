@@ -12,8 +12,8 @@ from iif_core.numerics.xp import NUMPY
 from lab.prior import materials
 from lab.prior.assets import SKY
 from lab.prior.palette import Palette
-from workflow.sources.rooms import shapes
-from workflow.sources.rooms.shapes import Shape
+from lab.rooms import shapes
+from lab.rooms.shapes import Shape
 
 WALLS = ("north", "south", "west", "east")
 

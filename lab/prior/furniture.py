@@ -8,8 +8,8 @@ from lab.prior import materials
 from lab.prior.building import WALLS, Building, Top, bounds, box
 from lab.prior.palette import of_tone
 from lab.prior.solids import solid
-from workflow.sources.rooms import shapes
-from workflow.sources.rooms.shapes import Shape
+from lab.rooms import shapes
+from lab.rooms.shapes import Shape
 
 
 def furnish(building: Building) -> None:

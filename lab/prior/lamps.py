@@ -6,7 +6,7 @@ import numpy as np
 
 from lab.prior.building import Building, box
 from lab.prior.palette import of_tone
-from workflow.sources.rooms import shapes
+from lab.rooms import shapes
 
 
 def light_up(building: Building) -> None:

@@ -1,6 +1,6 @@
 """What surface looks like at a point: one row of numbers per object, evaluated alike by NumPy and by the renderer.
 
-The product's solid textures (`workflow.sources.rooms.patterns`) are the base. Added are patterns of things in rooms, layers of
+The product's solid textures (`lab.rooms.patterns`) are the base. Added are patterns of things in rooms, layers of
 pictures, dirt and uneven gloss:
 
     albedo = (1 - dirt n^2) mix(mix(first, second, t), third, s)      or (1 - dirt n^2) first * picture
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.numerics.xp import Namespace
-from workflow.sources.rooms import patterns
+from lab.rooms import patterns
 
 Array = np.ndarray
 Colour = tuple[float, float, float]

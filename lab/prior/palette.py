@@ -15,7 +15,7 @@ from iif_core.numerics.color import linear_from_srgb
 from lab.prior import materials
 from lab.prior.assets import Assets, measured_materials
 from lab.prior.materials import DARKEST, Colour
-from workflow.sources.rooms import patterns
+from lab.rooms import patterns
 
 Rng = np.random.Generator
 

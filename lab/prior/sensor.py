@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from iif_core.camera.simulation import ResponseCurve, exposures
+from lab.simulated.photographs import ResponseCurve, exposures
 
 HDR = 0.12
 """Share of the captures that deliver radiance."""

@@ -7,8 +7,8 @@ from scipy.ndimage import gaussian_filter
 
 from lab.prior.assets import Assets
 from lab.prior.building import WALLS, Building, Hole, box, sky_of
-from workflow.sources.rooms import shapes
-from workflow.sources.rooms.shapes import Shape
+from lab.rooms import shapes
+from lab.rooms.shapes import Shape
 
 OVERLAP = 0.02  # metres by which walls reach past their corners, so that no ray slips through
 REVEAL = 0.18  # depth of a window opening, metres

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from lab.prior.building import box
-from workflow.sources.rooms import shapes
-from workflow.sources.rooms.shapes import Shape
+from lab.rooms import shapes
+from lab.rooms.shapes import Shape
 
 
 def solid(rng: np.random.Generator, size: float) -> Shape:

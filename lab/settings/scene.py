@@ -1,18 +1,42 @@
-"""What must hold between the sections of the settings where another method than ours is chosen."""
+"""All settings of a scene of the laboratory."""
 
 from __future__ import annotations
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from lab.settings.methods import PUBLISHED
-from workflow.settings import scene
+from workflow.settings.scene import SceneSettings
+from workflow.settings.section import Section
 
 
-class SceneSettings(scene.SceneSettings):
-    """All settings of one scene."""
+class Relit(Section):
+    """Scores of pictures under new light, made by studies with `scores: relit_scores` (lab/docs/evaluation.md#relighting)."""
+
+    views: int = Field(3, ge=1)
+    """Views that are rendered under each light, spread evenly over all."""
+    lamps: int = Field(6, ge=0)
+    """At most this number of lamps shine alone, the strongest first."""
+    spheres: int = Field(3, ge=0)
+    """Positions of the glowing sphere on its path."""
+    moved: bool = True
+    """Whether the strongest lamp is moved."""
+    environment: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
+    """Uniform radiance from outside, all lamps off; null = none. A room without openings has no such picture."""
+    samples: int = Field(64, ge=1)
+    """Paths per pixel, of the source and of the recovered room alike."""
+    max_bounces: int = Field(8, ge=1, le=64)
+    """Longest path, in bounces."""
+    denoise: bool = True
+    """Denoise the pictures of both."""
+
+
+class LabScene(SceneSettings):
+    """The settings of the product, those of scored relighting, and what must hold where another method than ours is chosen."""
+
+    relit: Relit = Relit()
 
     @model_validator(mode="after")
-    def _published_photographs(self) -> SceneSettings:
+    def _published_photographs(self) -> LabScene:
         solver = self.emission.solver
         if solver in PUBLISHED and not isinstance(self.affines.response, str):
             raise ValueError(
@@ -27,7 +51,7 @@ class SceneSettings(scene.SceneSettings):
         return self
 
     @model_validator(mode="after")
-    def _forced_components(self) -> SceneSettings:
+    def _forced_components(self) -> LabScene:
         forced = {name: value for name, value in self.override.components.model_dump().items() if value != "auto"}
         if forced and (self.emission.solver in PUBLISHED or self.shading.method == "published"):
             raise ValueError(f"`override: components: {', '.join(forced)}`: the published method has no plan; remove it")

@@ -132,7 +132,7 @@ def small_rooms(size: int = 32) -> dict[str, Room]:
 def _kitchen(size: int) -> Room:
     """The built-in kitchen as the first camera sees it; an object has the material of the middle of its faces, in the mean."""
     from iif_core.camera.pinhole import pixel_directions
-    from workflow.sources import rooms as builtin
+    from lab import rooms as builtin
 
     room = builtin.build("kitchen")
     middle = room.vertices[room.faces].mean(1)

@@ -62,10 +62,11 @@ def found(source: dict[str, Any], points: bool = False, **capture: Any) -> None:
     """Find and check a scene, read what it has of pictures and ids, and write under the names of its views."""
     import importlib
 
+    from workflow import plugins
     from workflow.sources.folder_scene import images
 
     tree = document(source, **capture)
-    module = importlib.import_module(f"workflow.sources.{source['kind']}")
+    module = importlib.import_module(plugins.implementation("source", source["kind"]))
     more = {"points": True} if points else {}
     finder = module.find_inputs if hasattr(module, "find_inputs") else None
     if finder is None:
@@ -404,14 +405,14 @@ def mitsuba_scene(home: Path) -> None:
 
 
 def read_mitsuba_scene() -> None:
-    from workflow.sources import mitsuba
+    from lab.sources import mitsuba
 
     mitsuba.raw_inputs({"source": {"path": "scene.xml"}})
 
 
 def load_mitsuba_scene() -> None:
     """Load as stage `capture` first does: in a separate process, which Mitsuba may end. An error there is raised here."""
-    from workflow.sources.mitsuba_scene import scene, trial
+    from lab.mitsuba_scene import scene, trial
 
     read_mitsuba_scene()
     told, tell = os.pipe()

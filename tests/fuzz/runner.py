@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+import lab  # noqa: F401  registers its plug-in: its sources are read too
 from iif_core.errors import InputError
 from tests.fuzz import mutators
 from tests.fuzz.corpora import TARGETS, Target
@@ -250,11 +251,11 @@ def warm() -> None:
     import trimesh  # noqa: F401
     from PIL import Image
 
+    import lab.sources.mitsuba  # noqa: F401
     import workflow.comparison.maps  # noqa: F401
     import workflow.priors.files  # noqa: F401
     import workflow.relighting.world  # noqa: F401
     import workflow.segmentations.masks  # noqa: F401
-    import workflow.sources.mitsuba  # noqa: F401
     import workflow.sources.scannetpp  # noqa: F401
 
     Image.init()

@@ -11,8 +11,8 @@ from iif_core.numerics.color import srgb_from_linear
 from iif_core.numerics.xp import NUMPY
 from lab.prior import materials, palette
 from lab.prior.assets import Assets, load, measured_materials
+from lab.rooms import patterns
 from tests.errors import refused
-from workflow.sources.rooms import patterns
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ POINTS = 600
 
 
 def room():
-    from workflow.sources import rooms
+    from lab import rooms
 
     return rooms.build("tiny")
 
@@ -95,10 +95,10 @@ def directions(camera, lens, pose):
 
 def traced(room, count, samples, camera=CAMERA, lens=LENS):
     """(pose, picture in [0, 1]) of every view: path traced, with one exposure for all."""
-    from iif_core.camera.simulation import expose, response_curve
     from iif_core.light.transport.emitters import Emitters
     from iif_core.light.transport.render import render
     from iif_core.light.transport.scene import PathOptions, Scene
+    from lab.simulated.photographs import expose, response_curve
 
     shape = geometry(room)
     emitters = Emitters(shape, room.emission, np.ones(len(room.faces), np.int8))
@@ -153,7 +153,7 @@ def colmap_text(folder, of_room, poses, prefix=""):
     k = " ".join(map(repr, LENS.k))
     lens = f"OPENCV_FISHEYE {CAMERA.width} {CAMERA.height} {CAMERA.fx} {CAMERA.fy} {CAMERA.cx} {CAMERA.cy} {k}"
     (folder / "cameras.txt").write_text(f"# one camera\n1 {lens}\n")
-    from workflow.sources.rooms.coverage import surface_points
+    from lab.rooms.coverage import surface_points
 
     points = surface_points(of_room, POINTS)
     shape = geometry(of_room)

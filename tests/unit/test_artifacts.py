@@ -62,6 +62,20 @@ def test_round_trip(stage):
     assert reader.json("base.json") == {"edge": 0.01}
 
 
+def test_a_file_is_hashed_once_in_a_process_until_somebody_touches_it(stage, monkeypatch):
+    folder, read = stage[0], []
+    original = files.sha256_of
+    monkeypatch.setattr(files, "sha256_of", lambda path: read.append(path.name) or original(path))
+    for _ in range(3):
+        StageReader(folder, "base", "s").exr("maps/v.exr")
+    assert read == ["v.exr"]
+    data = bytearray((folder / "maps/v.exr").read_bytes())
+    data[len(data) // 2] ^= 1
+    (folder / "maps/v.exr").write_bytes(data)
+    with pytest.raises(DamagedArtefact, match="its content changed"):
+        StageReader(folder, "base", "s").exr("maps/v.exr")
+
+
 @pytest.mark.parametrize("name, reader", [("maps/v.exr", "read_exr"), ("cells.parquet", "read_parquet")])
 def test_an_error_of_the_disk_is_not_called_damage(stage, monkeypatch, name, reader):
     """What a library says of the content of a file is damage."""
@@ -295,9 +309,8 @@ def test_a_file_is_never_written_through_a_link(tmp_path, monkeypatch):
     log.symlink_to(outside)
     root = logging.getLogger()
     monkeypatch.setattr(root, "handlers", [])
-    for opens in (lambda: configure_logging(log), lambda: locks.briefly(log).__enter__()):
-        with refused(log, outside):
-            opens()
+    with refused(log, outside):
+        configure_logging(log)
     assert outside.read_text() == "mine"
 
 
@@ -359,11 +372,8 @@ def test_results_from_which_something_was_published_must_be_there(tmp_path):
     assert "results/s: " in line and line.endswith("scenes/s --forcerun publish")
 
 
-@pytest.mark.parametrize("finished", ["publish", "report"])
-def test_what_was_published_must_be_there(tmp_path, finished):
-    chain(tmp_path, finished)
-    (tmp_path / "results/s/logs").mkdir()
-    (tmp_path / "results/s/logs/publish.log").touch()
+def test_what_was_published_must_be_there(tmp_path):
+    chain(tmp_path, "publish")
     (line,) = damaged(tmp_path)
     assert "scenes/s: " in line and line.endswith("snakemake --cores 2 scenes/s --forcerun publish")
     assert list(damaged(tmp_path, ["other"])) == []
@@ -411,17 +421,16 @@ def test_verify_names_links_and_what_lies_hidden(tmp_path):
         (folder / name).touch()
     assert [line.split(";")[0].removeprefix(f"{tmp_path}/") for line in damaged(tmp_path)] == [
         "results/s/base/a.json: a symbolic link in the place of a file",
-        "results/s/base/maps: not written by rule base (not in its manifest)",
+        f"results/s/base/maps: not written by rule base (not in {tmp_path}/results/s/base/manifest.json)",
         f"results/s/logs: a symbolic link to {shown(str(tmp_path))}, and what is behind it would be overwritten or removed."
         " Remove the"
         " link, or put what it leads to in its place",
-        f"scenes/s/.hidden: not published (not in {folder}/manifest.json)",
+        f"scenes/s/.hidden: not written by rule publish (not in {folder}/manifest.json)",
         "scenes/s/manifest.json: a symbolic link in the place of a file",
     ]
 
 
-@pytest.mark.parametrize("left", ["files", "stamps"])
-def test_verify_names_a_manifest_that_was_taken_from_its_files(tmp_path, left):
+def test_verify_names_a_manifest_that_was_taken_from_its_files(tmp_path):
     """Nothing was made from the stage. One that a job left unfinished is no damage."""
     writer = StageWriter(tmp_path / "results/s/base", provenance() | {"scene": "s"})
     writer.json("a.json", {})
@@ -429,9 +438,7 @@ def test_verify_names_a_manifest_that_was_taken_from_its_files(tmp_path, left):
     chain(tmp_path, "capture")
     assert list(damaged(tmp_path)) == []  # a part of a stage is made
     writer.finish()
-    if left == "stamps":
-        stamps.stamp_stage(tmp_path / "results", "s", "base")
-        (tmp_path / "results/s/base/a.json").unlink()
+    writer.stamps.save(stamps.place(tmp_path / "results", "s", "base"))
     (tmp_path / "results/s/base/manifest.json").unlink()
     shutil.rmtree(tmp_path / "results/s/capture")  # it is looked for also where no manifest is left
     (line,) = damaged(tmp_path)
@@ -439,10 +446,6 @@ def test_verify_names_a_manifest_that_was_taken_from_its_files(tmp_path, left):
         f"{tmp_path}/results/s/base/manifest.json: missing, although it was finished; rebuild with:"
         " snakemake --cores 2 results/s/base/manifest.json"
     )
-    state = tmp_path / "results/s/logs/base.state.json"
-    state.parent.mkdir()
-    state.touch()
-    assert len(list(damaged(tmp_path))) == (left == "stamps")
 
 
 @pytest.mark.parametrize("harm", ["none", "removed", "changed", "of another stage", "forged"])
@@ -479,12 +482,6 @@ def test_verify_does_not_take_one_variant_for_another(tmp_path):
     shutil.rmtree(tmp_path / "results/room--v1/capture")
     (line,) = damaged(tmp_path)
     named(line, tmp_path / "results/room--v1/capture/manifest.json", tmp_path / "results/room--v1/base")
-    shutil.rmtree(tmp_path / "results/room--v1/base")
-    (line,) = damaged(tmp_path)
-    named(line, tmp_path / "results/room--v1/base/manifest.json", folder)
-    digest = sha256_of(tmp_path / "results/room--v2/base/manifest.json")
-    manifests.write(folder / "manifest.json", document | {"manifests": {"base": digest}})
-    assert list(damaged(tmp_path)) == []  # this one it shares
 
 
 def test_verify_of_nothing_promises_nothing(tmp_path, monkeypatch, capsys):

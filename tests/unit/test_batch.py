@@ -17,7 +17,6 @@ from tests.errors import missing, named, refused
 from workflow import settings
 from workflow.artifacts import StageWriter, sound, stamps
 from workflow.artifacts.files import write_exr, write_json, write_parquet
-from workflow.artifacts.manifest import EARLIER_SCHEMA
 from workflow.batch import causes, summary
 from workflow.batch import plan as batch_plan
 from workflow.runtime import fingerprint as fp
@@ -194,10 +193,10 @@ def test_a_base_may_lack_what_the_line_gives(project, tmp_path):
         ("a\t\t\ttpl\tcapture.veiws=3", ["line 2, column overrides", "capture.veiws", "views"]),
         ("a\t\t\ttpl\tcapture.views=0", ["line 2, column overrides", "capture.views", 0, 1]),
         ("a\t\t\ttpl\tcapture=3", ["line 2, column overrides", "capture", 3, "key: value"]),
-        ("a\tfoldr\tx\t\tprior.kind=retinex", ["line 2, column source", "source.kind", "'foldr'", "builtin, mitsuba, folder"]),
+        ("a\tfoldr\tx\t\tprior.kind=retinex", ["line 2, column source", "source.kind", "'foldr'", "fipt, builtin, mitsuba"]),
         ("a\tfolder\t\t\tprior.kind=retinex", ["line 2, column path", "source.path", "config/scenes/kitchen.yaml"]),
         ("a\tfolder\tx\t\tprior.kind=retinx", ["line 2, column overrides", "prior.kind", "'retinx'", "retinex"]),
-        ("a\tbuiltin\tx\ttpl\tprior.kind=simulated", ["line 2, column path", "source.path", "builtin", "source.kind"]),
+        ("a\tbuiltin\tx\ttpl\tprior.kind=simulated", ["line 2, column path", "source.path", "kind, quarterings, scene"]),
         ("a\t\t\ttlp\t", ["line 2, column base", "config/scenes/tlp.yaml", "tpl"]),
         ("a\t\t\ttpl\tviews", ["line 2, column overrides", "'views'", "key=value"]),
         ("a\t\t\tbad\t", ["config/scenes/bad.yaml", "config/batch.tsv, line 2", "seed", "'x'"]),
@@ -233,7 +232,7 @@ def test_every_scene_is_refused_by_itself(project, monkeypatch):
         "gone\n"
         "disk\tmitsuba\tx.xml\t\tprior.kind=simulated\n"
     )
-    from workflow.sources import mitsuba
+    from lab.sources import mitsuba
 
     monkeypatch.setattr(mitsuba, "raw_inputs", lambda document: 1 / 0)
     plan = batch_plan.plan("draft")
@@ -256,30 +255,24 @@ def segmented(scene):
     writer = StageWriter(Path("results") / scene / "segmentation", facts)
     writer.table("objects.parquet", {"object_id": np.arange(1), "name": ["floor"]})
     writer.finish()
-    stamps.stamp_stage(Path("results"), scene, "segmentation")
+    writer.stamps.save(stamps.place(Path("results"), scene, "segmentation"))
     sound.forget()
     return Path("results") / scene / "segmentation"
 
 
 def test_what_lies_in_the_folders_of_a_scene_refuses_that_scene_alone(project):
-    project(
-        "".join(f"{name}\t{SMALL}\n" for name in ("good", "file", "stage", "logs", "earlier", "link")) + f"name\t{WRONG_NAME}\n"
-    )
+    project("".join(f"{name}\t{SMALL}\n" for name in ("good", "file", "stage", "logs", "link")) + f"name\t{WRONG_NAME}\n")
     for path in ("scenes/file", "results/stage/render", "results/logs/logs"):
         Path(path).parent.mkdir(parents=True)
         Path(path).touch()
     Path("scenes/link").symlink_to("../config")
     segmented("name")
-    manifest = segmented("earlier") / "manifest.json"
-    document = json.loads(manifest.read_text())
-    write_json(manifest, document | {"schema": EARLIER_SCHEMA})
     plan = batch_plan.plan("draft")
     assert list(plan.ready) == ["good"]
     for name, names in {
         "file": ["scenes/file"],
         "stage": ["results/stage/render"],
         "logs": ["results/logs/logs"],
-        "earlier": ["python -m workflow upgrade earlier"],
         "name": ["overrides", "'nosuchthing'"],
         "link": ["scenes/link"],
     }.items():

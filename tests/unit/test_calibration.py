@@ -6,7 +6,7 @@ import pytest
 from iif_core.camera.calibration.choice import CANDIDATES, calibrate_response, candidates
 from iif_core.camera.overlap import PatchRows, join_rows, no_rows, patch_rows
 from iif_core.camera.response import response
-from iif_core.camera.simulation import response_curve
+from lab.simulated.photographs import response_curve
 
 EXPOSURES = np.array([0.25, 0.5, 1.0, 2.0, 4.0, 0.25, 1.0, 4.0])
 X = np.linspace(0, 1, 101)[:, None].repeat(3, 1)

@@ -16,8 +16,8 @@ from iif_core.fusion.options import FusionOptions
 from iif_core.fusion.problem import LOWEST, NEUTRAL, FusionProblem, object_means, prediction_faults
 from iif_core.fusion.selection import selection_weights
 from iif_core.numerics import laplace
-from iif_core.priors import simulate
 from iif_core.surface.segments import interior, segment_table
+from lab.simulated import errors as simulate
 from tests.errors import refused
 from tests.oracles import scores as single
 

@@ -5,7 +5,7 @@ import pyarrow
 import pyarrow.parquet
 import pytest
 
-from iif_core.camera.simulation import response_curve
+from lab.simulated.photographs import response_curve
 from tests.errors import refused
 from workflow import settings
 from workflow.runtime.fingerprint import raw_inputs

@@ -79,7 +79,10 @@ def published(scene="a", **changed):
     document = {"settings": json.loads(fp.resolved(scene, "draft")), "quality": "draft"}
     document |= {"fingerprint": fp.fingerprint("publish", scene, "draft"), "files": {}} | changed
     write_json(Path(f"scenes/{scene}/manifest.json"), document)
-    stamps.note(stamps.place(Path("results"), scene, stamps.DELIVERABLE), Path("scenes") / scene, document)
+    noted = stamps.Stamps()
+    for name in ("manifest.json", *document["files"]):
+        noted.of(f"scenes/{scene}/{name}")
+    noted.save(stamps.place(Path("results"), scene, stamps.DELIVERABLE))
 
 
 # ------------------------------------------------------------------------------------------------------- running or killed

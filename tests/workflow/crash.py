@@ -60,7 +60,6 @@ def perform(mark: str) -> None:
         mark: its fingerprint, from which all of its values follow but those of a part that is taken over from earlier settings.
     """
     results = Path("results")
-    stamps.place(results, "s", "base").unlink(missing_ok=True)
     facts = {"scene": "s", "stage": "base", "quality": "draft", "fingerprint": mark, "inputs": {}}
     writer = StageWriter(results / "s/base", facts)
     number = int(mark, 16)
@@ -85,7 +84,7 @@ def perform(mark: str) -> None:
     writer.json("facts.json", said)
     writer.bytes("page.html", b"<p>" + bytes(mark, "ascii"))
     writer.finish()
-    stamps.stamp_stage(results, "s", "base")
+    writer.stamps.save(stamps.place(results, "s", "base"), flushed=True)
 
 
 def of_stage(content: Tree) -> Tree:
@@ -112,7 +111,7 @@ def stage_is_sound(wanted: dict[str, Tree], mark: str) -> str:
         content = {}
         if Path("results/s/base", MANIFEST).is_file():
             raise Wrong(f"a manifest is there, and files are not what it says: {error}") from None
-    sound.stage_faults.cache_clear()
+    sound.forget()
     planned = Path("results/s/base", MANIFEST).is_file() and sound.stage_faults(Path("results"), "s", "base", mark) == ()
     if planned and found != mark:
         raise Wrong(f"a plan takes the stage for finished, and it has {found!r}")

@@ -20,6 +20,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import lab  # noqa: F401  for the rooms of the laboratory
 from iif_core.errors import InputError
 from tests.workflow.crash import FAULTS, Tally, Tree, Wrong, unflushed
 from tests.workflow.faulty_disk import Disk, Fault, lay_out, tree

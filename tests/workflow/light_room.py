@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from iif_core.camera.pinhole import look_at, pixel_directions
-from iif_core.camera.simulation import response_curve
 from iif_core.requirements.evidence import NOTHING
 from iif_core.surface.cells import grid_origin, pack_keys, unpack_keys, voxel_indices
+from lab.simulated.photographs import response_curve
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.store import ids_to_disk, split_rgb
 from workflow.decisions import plan as decisions

@@ -46,9 +46,17 @@ def prepare(scenes: Sequence[str], template: str, quality: str = "draft", said: 
         return
     for scene in [template, *scenes]:  # every link of a file changes the time stamp of its inode, which all of them share
         for stage in _stages(template):
-            stamps.stamp_stage(RESULTS, scene, stage)
-        document = manifests.read(SCENES / scene / MANIFEST, SCENE_SCHEMA)
-        stamps.note(stamps.place(RESULTS, scene, stamps.DELIVERABLE), SCENES / scene, document)
+            _noted(RESULTS / scene / stage, manifests.STAGE_SCHEMA, stamps.place(RESULTS, scene, stage))
+        _noted(SCENES / scene, SCENE_SCHEMA, stamps.place(RESULTS, scene, stamps.DELIVERABLE))
+
+
+def _noted(folder: Path, schema: str, place: Path) -> None:
+    """Note the hashes of a folder as its job would have done."""
+    document, digest = manifests.load(folder / MANIFEST, schema)
+    noted = stamps.Stamps()
+    for name, found in {MANIFEST: digest, **{name: facts["sha256"] for name, facts in document["files"].items()}}.items():
+        noted.note(folder / name, stamps.stamp_of(folder / name), found)
+    noted.save(place)
 
 
 def _stages(scene: str) -> list[str]:

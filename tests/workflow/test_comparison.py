@@ -117,7 +117,8 @@ def test_results_that_are_not_there_stop_before_any_job(workflow):
 def test_the_tiny_room_under_new_light(workflow):
     path = workflow.folder / "config/scenes/tiny.yaml"
     path.write_text(path.read_text() + "relit: {views: 1, lamps: 1, spheres: 1, samples: 64}\n")
-    result = workflow.run("results/tiny/relit_scores/manifest.json")
+    laboratory = str(workflow.repository / "lab/Snakefile")
+    result = workflow.run("-s", laboratory, "results/tiny/relit_scores/manifest.json")
     assert result.returncode == 0, result.stderr[-3000:]
     folder = workflow.folder / "results/tiny"
     lights = json.loads((folder / "relit_truth/lights.json").read_text())

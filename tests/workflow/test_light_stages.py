@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, Room, StubJob, build, write_plan
 
-from iif_core.camera.simulation import response_curve
+from lab.simulated.photographs import response_curve
 from tests.errors import refused
 from workflow.artifacts import files
 from workflow.registry import STAGES

@@ -31,20 +31,6 @@ def place(results: Path, scene: str, stage: str) -> Path:
 
 
 @contextmanager
-def briefly(path: Path) -> Iterator[None]:
-    """Wait for the lock of a file and hold it, for what takes no time: reading, changing and writing a file that many processes
-    add to. On a disk without locks the work continues without one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with links.open_there(path, "a") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX)
-        except OSError as error:
-            if error.errno not in _UNSUPPORTED:
-                raise
-        yield
-
-
-@contextmanager
 def alone(results: Path, scene: str, stage: str) -> Iterator[None]:
     """Hold the lock of a stage of a scene. On a disk without locks, such as some network disks, log a warning and continue.
 

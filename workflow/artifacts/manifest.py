@@ -1,7 +1,7 @@
 """Manifests: what a finished stage or a deliverable wrote, as sealed JSON of one possible spelling.
 
-`json.dumps(document, indent=1, sort_keys=True)` makes the text; its key `seal` is the SHA-256 of the text without that key. A
-file was changed if any byte differs from what `json.dumps` makes of its content, or if its seal does not fit the rest.
+`json.dumps(document, indent=1, sort_keys=True)` makes the text; its key `seal` is the SHA-256 of the text without that key. So a
+change of any byte shows.
 """
 
 from __future__ import annotations
@@ -9,20 +9,54 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import pydantic
 
 from workflow.artifacts.files import read_record, write_atomically
 
 MANIFEST = "manifest.json"
 STAGE_SCHEMA = "iif.stage/2"
-EARLIER_SCHEMA = "iif.stage/1"
-"""Without a seal and without the scene of inputs; `workflow.artifacts.upgrade` brings it up to date."""
 SCENE_SCHEMA = "iif.scene/2"
-EARLIER_SCENE_SCHEMA = "iif.scene/1"
+_SEAL = b'\n "seal": "'
 
 
 class Broken(ValueError):
     """A manifest is not what was written; the message says what is wrong, without the path."""
+
+
+class _Form(pydantic.BaseModel, strict=True, extra="allow"):
+    pass
+
+
+class _File(_Form):
+    sha256: str
+    bytes: int
+    shape: list[Annotated[int, pydantic.Field(ge=0, lt=1 << 40)]] = []
+
+
+class _Input(_Form):
+    scene: str
+    manifest_sha256: str
+
+
+class _Manifest(_Form):
+    """What readers rely on, and only somebody who forges a manifest can leave out."""
+
+    files: dict[str, _File]
+    inputs: dict[str, _Input] = {}
+    manifests: dict[str, str] = {}
+    fingerprints: dict[str, str] = {}
+    stage: str | None = None
+    scene: str | None = None
+    quality: str | None = None
+    fingerprint: str | None = None
+
+
+class _Part(_Form):
+    by: str
+    files: dict[str, _File]
+    facts: Any
 
 
 def text_of(document: dict[str, Any]) -> str:
@@ -52,7 +86,7 @@ def sealed(data: bytes) -> dict[str, Any]:
         Broken: it is no JSON object, or was changed since it was written.
     """
     document = _object(data)
-    _compare(document, data)
+    _compare(data)
     return {key: value for key, value in document.items() if key != "seal"}
 
 
@@ -66,13 +100,25 @@ def _object(data: bytes) -> dict[str, Any]:
     return document
 
 
-def _compare(document: dict[str, Any], data: bytes) -> None:
+def _compare(data: bytes) -> None:
+    """Compare the seal with the rest of the text, which is what stood there before the line of the seal was put in."""
+    start = data.rfind(_SEAL)
+    end = data.find(b"\n", start + 1)
+    seal, after = data[start + len(_SEAL) : end].removesuffix(b",").removesuffix(b'"'), data[end - 1 : end] == b","
+    if start > 0 and end > 0 and data.count(_SEAL) == 1:
+        before = data[:start] if after else data[:start].removesuffix(b",")
+        if hashlib.sha256(before + data[end:]).hexdigest().encode() == seal:
+            return
+    raise Broken("its content changed since it was written (its seal does not fit)")
+
+
+def _check(document: Any, form: type[_Form]) -> dict[str, Any]:
     try:
-        text = text_of(document).encode()
-    except (ValueError, RecursionError):
-        text = b""
-    if text != data:
-        raise Broken("its content changed since it was written (its seal does not fit)")
+        form.model_validate(document)
+    except pydantic.ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise Broken(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    return document
 
 
 def parse(data: bytes, schema: str) -> dict[str, Any]:
@@ -86,30 +132,10 @@ def parse(data: bytes, schema: str) -> dict[str, Any]:
         Broken: it is no JSON object, has another schema, was changed since it was written, or lists no files.
     """
     document = _object(data)
-    found = document.get("schema")
-    if found != schema:
-        older = found in (EARLIER_SCHEMA, EARLIER_SCENE_SCHEMA)
-        hint = "; `python -m workflow upgrade` brings artefacts of earlier versions up to date" if older else ""
-        raise Broken(f"schema {found!r}, this version reads {schema!r}{hint}")
-    _compare(document, data)
-    files = document.get("files")
-    if not isinstance(files, dict) or not all(
-        isinstance(facts, dict) and {"sha256", "bytes"} <= set(facts) for facts in files.values()
-    ):
-        raise Broken("it lists no files with their hashes")
-    if problem := _wrong_facts(document):
-        raise Broken(problem)
-    return document
-
-
-def _wrong_files(files: dict[str, Any]) -> str:
-    for name, facts in files.items():
-        shape = facts.get("shape", [])
-        if not isinstance(facts["sha256"], str) or not isinstance(facts["bytes"], int):
-            return f"its entry of {name!r} is no hash and size"
-        if not isinstance(shape, list) or not all(isinstance(size, int) and 0 <= size < 1 << 40 for size in shape):
-            return f"its entry of {name!r} has no shape"
-    return ""
+    if document.get("schema") != schema:
+        raise Broken(f"schema {document.get('schema')!r}, this version reads {schema!r}")
+    _compare(data)
+    return _check(document, _Manifest)
 
 
 def part(document: Any) -> dict[str, Any]:
@@ -118,34 +144,7 @@ def part(document: Any) -> dict[str, Any]:
     Raises:
         Broken: it is not of the form that stages write.
     """
-    if not isinstance(document, dict) or not isinstance(document.get("by"), str) or "facts" not in document:
-        raise Broken("it is no note of a part")
-    files = document.get("files")
-    if not isinstance(files, dict) or not all(isinstance(f, dict) and {"sha256", "bytes"} <= set(f) for f in files.values()):
-        raise Broken("it lists no files with their hashes")
-    if problem := _wrong_files(files):
-        raise Broken(problem)
-    return document
-
-
-def _wrong_facts(document: dict[str, Any]) -> str:
-    """Return which entry of a manifest is not of the form that stages write, which only somebody who forges it can change."""
-    if problem := _wrong_files(document["files"]):
-        return problem
-    inputs = document.get("inputs", {})
-    if not isinstance(inputs, dict) or not all(
-        isinstance(facts, dict) and isinstance(facts.get("scene"), str) and isinstance(facts.get("manifest_sha256"), str)
-        for facts in inputs.values()
-    ):
-        return "its inputs are not stages with their hashes"
-    for key in ("manifests", "fingerprints"):
-        listed = document.get(key, {})
-        if not isinstance(listed, dict) or not all(isinstance(value, str) for value in listed.values()):
-            return f"its {key} are no list of hashes"
-    for key in ("stage", "scene", "quality", "fingerprint"):
-        if not isinstance(document.get(key, ""), str | None):
-            return f"its {key} is no text"
-    return ""
+    return _check(document, _Part)
 
 
 def read(path: Path, schema: str = STAGE_SCHEMA) -> dict[str, Any]:
@@ -165,6 +164,6 @@ def load(path: Path, schema: str = STAGE_SCHEMA) -> tuple[dict[str, Any], str]:
     """
     try:
         data = read_record(path)
-    except OSError as error:
-        raise Broken(f"not readable ({error.strerror})") from None
+    except (OSError, ValueError) as error:
+        raise Broken(f"not readable ({getattr(error, 'strerror', error)})") from None
     return parse(data, schema), hashlib.sha256(data).hexdigest()

@@ -13,9 +13,10 @@ from typing import Any
 
 from iif_core.errors import InputError
 from workflow.artifacts import files as io
-from workflow.artifacts import links, stamps
+from workflow.artifacts import links
 from workflow.artifacts import manifest as manifests
-from workflow.artifacts.manifest import EARLIER_SCHEMA, MANIFEST, SCENE_SCHEMA, STAGE_SCHEMA
+from workflow.artifacts.manifest import MANIFEST, SCENE_SCHEMA, STAGE_SCHEMA
+from workflow.artifacts.stamps import DELIVERABLE, Stamps, place, stamp_of
 from workflow.registry import SHARED
 
 MOST_LINES = 3
@@ -24,7 +25,7 @@ MOST_LINES = 3
 
 @lru_cache(None)
 def stage_faults(results: Path, scene: str, stage: str, fingerprint: str) -> tuple[str, ...]:
-    """Return what is wrong with a finished stage, a line for each file; nothing if it is not finished.
+    """Return what is wrong with a finished stage, a line for each file; nothing if it never was finished.
 
     Args:
         results: folder of the results.
@@ -33,142 +34,14 @@ def stage_faults(results: Path, scene: str, stage: str, fingerprint: str) -> tup
             empty: it is to be made again, and there is nothing to tell.
 
     Raises:
-        InputError: it is of an earlier schema and would otherwise be what is wanted; or a link is where jobs of the scene write.
+        InputError: a link is where jobs of the scene write.
     """
     _without_links(results, scene)
-    folder, noted = results / scene / stage, stamps.place(results, scene, stage)
-    if not (folder / MANIFEST).is_file():
-        if noted.is_file():  # a job that starts removes it
-            return (f"{folder if not folder.is_dir() else folder / MANIFEST}: missing, although it was finished",)
-        # What its last job left unfinished is tried again, also where what was made from an earlier one is still there.
-        return ("",) if _ended_badly(results / scene / "logs" / f"{stage}.state.json", fingerprint) else ()
-    return tuple(_faults(folder, noted, STAGE_SCHEMA, scene, stage, fingerprint))
-
-
-def _ended_badly(state: Path, fingerprint: str) -> bool:
-    """Whether the last job of a stage did not end well, and was planned as what is wanted or run by hand.
-
-    Args:
-        state: file that the job left (`workflow/runtime/job_state.py`); a job that ends well deletes it.
-        fingerprint: under which the stage is wanted.
-    """
-    try:
-        document = json.loads(io.read_record(state))
-        return document["state"] in ("started", "failed") and document["fingerprint"] in ("", fingerprint)
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return False
-
-
-def _faults(folder: Path, noted: Path, schema: str, scene: str, stage: str, fingerprint: str) -> Iterator[str]:
-    known = stamps.load(noted)
-    own = known is not None and (known.scene, known.stage) == (scene, stage)
-    different = stamps.touched(folder, known) if known and own else None
-    if known and different == []:
-        yield from _broken_chain(folder, known.inputs) if known.fingerprint == fingerprint else [""]
-        return
-    seen = stamps.look(folder, [MANIFEST])
-    try:
-        document, digest = manifests.load(folder / MANIFEST, schema)
-    except manifests.Broken as error:
-        yield "" if _is_earlier(folder, fingerprint) else f"{folder / MANIFEST}: {error}"
-        return
-    found = document.get("scene"), document.get("stage", stage)
-    if found != (scene, stage):
-        owner = f"stage {found[1]} of scene {found[0]}" if stage else f"scene {found[0]}"
-        yield f"{folder / MANIFEST}: it belongs to {owner}, and was put here"
-        return
-    if document.get("fingerprint") != fingerprint:
-        put = known and own and known.fingerprint == fingerprint
-        yield f"{folder / MANIFEST}: it belongs to other settings, inputs or code, and was put here" if put else ""
-        return
-    some = None  # whose contents are compared: all
-    if known and different and (MANIFEST not in different or digest == known.manifest):
-        some = [name for name in different if name != MANIFEST]  # Snakemake touches a manifest when its job has ended
-        seen = {**known.files, **seen, **stamps.look(folder, some)}
-    else:
-        seen |= stamps.look(folder, document["files"])
-    problems = list(wrong_files(folder, document, some))
-    yield from problems
-    if not problems:
-        stamps.note(noted, folder, document, seen, digest, flushed=False)
-        yield from _broken_chain(folder, {k: (v.get("scene", ""), v.get("manifest_sha256", "")) for k, v in _inputs(document)})
-
-
-def _is_earlier(folder: Path, fingerprint: str) -> bool:
-    """Whether the manifest is of the earlier schema and of other settings than are wanted; one of the same is refused."""
-    try:
-        document = json.loads(io.read_record(folder / MANIFEST))
-        if document["schema"] != EARLIER_SCHEMA:
-            return False
-        same = document["fingerprint"] == fingerprint
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return False
-    if same:
-        raise InputError(
-            f"{folder / MANIFEST}: schema {EARLIER_SCHEMA!r}, this version reads {STAGE_SCHEMA!r}. `python -m workflow upgrade"
-            f" {folder.parent.name}` checks what is there and brings it up to date; or move {folder.parent} away to make it again"
-        )
-    return True
-
-
-def _inputs(document: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
-    inputs = document.get("inputs", {})
-    return list(inputs.items()) if isinstance(inputs, dict) else []
-
-
-def wrong_files(folder: Path, document: dict[str, Any], names: list[str] | None = None) -> Iterator[str]:
-    """Yield a line for each listed file that is missing or has another content.
-
-    Args:
-        folder: with the files.
-        document: its manifest.
-        names: which to look at; None = all.
-    """
-    for name, facts in sorted(document["files"].items()):
-        if names is not None and name not in names:
-            continue
-        path = folder / name
-        try:
-            io.inside(folder, name)
-        except InputError as error:
-            yield str(error)
-            continue
-        try:
-            if not path.is_file():
-                yield f"{path}: missing"
-            elif (size := path.stat().st_size) != facts["bytes"]:
-                yield f"{path}: {size} bytes on disk, {facts['bytes']} were written"
-            elif io.sha256_of(path) != facts["sha256"]:
-                yield f"{path}: its content changed since it was written (sha256 differs)"
-        except FileNotFoundError:  # a job that makes it again has removed it meanwhile
-            yield f"{path}: missing"
-
-
-def _broken_chain(folder: Path, inputs: Any) -> Iterator[str]:
-    """Yield a line if a stage that is there is not the one from which this one was made."""
-    results = folder.parent.parent
-    for name, (scene, digest) in inputs.items():
-        stage = name.removeprefix(SHARED)
-        found = _digest_of(results, scene, stage)
-        if found is not None and found != digest:
-            yield f"{folder}: it was made from another {results / scene / stage} than is there now"
-            return
-
-
-@lru_cache(None)
-def _digest_of(results: Path, scene: str, stage: str) -> str | None:
-    """Return the SHA-256 of the manifest of a stage; None if it is not finished."""
-    path = results / scene / stage / MANIFEST
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    if not path.is_file():
-        return None
-    known = stamps.load(stamps.place(results, scene, stage))
-    if known and known.files.get(MANIFEST) == stamps.stamp_of(status):
-        return known.manifest
-    return io.sha256_of(path)
+    folder = results / scene / stage
+    if not (folder / MANIFEST).is_file():  # a job that makes it again and is killed leaves the stamps as well
+        gone = folder / MANIFEST if folder.is_dir() else folder
+        return (f"{gone}: missing, although it was finished",) if place(results, scene, stage).is_file() else ()
+    return tuple(_faults(folder, _noted(results, scene, stage), STAGE_SCHEMA, {"scene": scene, "stage": stage}, fingerprint))
 
 
 @lru_cache(None)
@@ -189,7 +62,90 @@ def deliverable_faults(folder: Path, results: Path, scene: str, fingerprint: str
         return ()
     if not (folder / MANIFEST).is_file():
         return (f"{folder / MANIFEST}: missing",)
-    return tuple(_faults(folder, stamps.place(results, scene, stamps.DELIVERABLE), SCENE_SCHEMA, scene, "", fingerprint))
+    noted = _noted(results, scene, DELIVERABLE)
+    return tuple(_faults(folder, noted, SCENE_SCHEMA, {"scene": scene}, fingerprint))
+
+
+def _faults(folder: Path, noted: Stamps, schema: str, owner: dict[str, str], fingerprint: str) -> Iterator[str]:
+    try:
+        document, _ = _manifest(folder / MANIFEST, noted, schema)
+    except manifests.Broken as error:
+        yield f"{folder / MANIFEST}: {error}"
+        return
+    if found := of_another(document, owner):
+        yield f"{folder / MANIFEST}: {found}"
+    elif document.get("fingerprint") != fingerprint:
+        yield ""
+    elif problems := list(wrong_files(folder, document, noted)):
+        yield from problems
+    else:
+        yield from made_from_another(folder, document)
+    noted.save()
+
+
+def _manifest(path: Path, noted: Stamps, schema: str) -> tuple[dict[str, Any], str]:
+    """Return the content and the SHA-256 of a manifest. The seal of one that nobody touched is not compared again."""
+    if known := noted.known(path):
+        return json.loads(io.read_record(path)), known
+    stamp = stamp_of(path)
+    document, digest = manifests.load(path, schema)
+    noted.note(path, stamp, digest)
+    return document, digest
+
+
+def of_another(document: dict[str, Any], owner: dict[str, str]) -> str:
+    """Return whose manifest it is, if it is not that of `owner` (scene and, for a stage, stage); otherwise an empty text."""
+    found = {key: document.get(key) for key in owner}
+    if found == owner:
+        return ""
+    return f"it belongs to {' of '.join(f'{key} {found[key]}' for key in reversed(owner))}, and was put here"
+
+
+def wrong_files(folder: Path, document: dict[str, Any], noted: Stamps | None = None) -> Iterator[str]:
+    """Yield a line for each listed file that is missing or has another content.
+
+    Args:
+        folder: with the files.
+        document: its manifest.
+        noted: hashes of those that nobody touched; the others are read. None = all are read.
+    """
+    for name, facts in sorted(document["files"].items()):
+        path = f"{folder}/{name}"
+        if noted and noted.known(path) == facts["sha256"]:
+            continue
+        try:
+            io.inside(folder, name)
+            if not Path(path).is_file():
+                yield f"{path}: missing"
+            elif (size := Path(path).stat().st_size) != facts["bytes"]:
+                yield f"{path}: {size} bytes on disk, {facts['bytes']} were written"
+            elif (noted.of(path) if noted else io.sha256_of(Path(path))) != facts["sha256"]:
+                yield f"{path}: its content changed since it was written (sha256 differs)"
+        except InputError as error:
+            yield str(error)
+        except FileNotFoundError:  # a job that makes it again has removed it meanwhile
+            yield f"{path}: missing"
+
+
+def made_from_another(folder: Path, document: dict[str, Any]) -> Iterator[str]:
+    """Yield a line if a stage that is there is not the one from which that of `folder` was made."""
+    results = folder.parent.parent
+    for name, facts in document.get("inputs", {}).items():
+        source = results / facts["scene"] / name.removeprefix(SHARED)
+        found = _digest_of(results, facts["scene"], name.removeprefix(SHARED))
+        if found is not None and found != facts["manifest_sha256"]:
+            yield f"{folder}: it was made from another {source} than is there now"
+            return
+
+
+@lru_cache(None)
+def _digest_of(results: Path, scene: str, stage: str) -> str | None:
+    """Return the SHA-256 of the manifest of a stage; None if it is not there or damaged, as its own stage reports."""
+    path, noted = results / scene / stage / MANIFEST, _noted(results, scene, stage)
+    try:
+        return noted.known(path) or _manifest(path, noted, STAGE_SCHEMA)[1]
+    except manifests.Broken:
+        return None
 
 
 @lru_cache(None)
@@ -200,22 +156,22 @@ def copy_faults(folder: Path, results: Path, scene: str, stage: str) -> tuple[st
         InputError: a link is where jobs of the scene write.
     """
     _without_links(results, scene)
-    source = results / scene / stage / MANIFEST
+    source, noted = results / scene / stage / MANIFEST, _noted(results, scene, f"{stage} {folder.name}")
     if not folder.is_dir() or not source.is_file():
         return ()
-    noted = stamps.place(results, scene, f"{stage} {folder.name}")
-    known = stamps.load(noted)
-    if known and known.manifest == _digest_of(results, scene, stage) and not stamps.touched(folder, known):
-        return ()
     try:
-        document, digest = manifests.load(source)
+        document, _ = _manifest(source, noted, STAGE_SCHEMA)
     except manifests.Broken:
         return ()  # the stage itself reports this
-    seen = stamps.look(folder, document["files"])
-    problems = tuple(wrong_files(folder, document))
-    if not problems:
-        stamps.note(noted, folder, document, seen, digest, copy=True, flushed=False)
+    problems = tuple(wrong_files(folder, document, noted))
+    noted.save()
     return problems
+
+
+@lru_cache(64)
+def _noted(results: Path, scene: str, of: str) -> Stamps:
+    """Return the stamps of a folder; those of a scene are kept while its stages are compared with one another."""
+    return Stamps(place(results, scene, of))
 
 
 @lru_cache(None)
@@ -226,7 +182,7 @@ def _without_links(results: Path, scene: str) -> None:
 
 def forget() -> None:
     """Compare anew what was compared: the results are kept for one plan."""
-    for compared in (stage_faults, deliverable_faults, copy_faults, _digest_of, _without_links):
+    for compared in (stage_faults, deliverable_faults, copy_faults, _digest_of, _noted, _without_links):
         compared.cache_clear()
 
 

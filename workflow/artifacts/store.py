@@ -11,11 +11,11 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.artifacts import files as io
-from workflow.artifacts import links, stamps
+from workflow.artifacts import links
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.manifest import MANIFEST, STAGE_SCHEMA
+from workflow.artifacts.stamps import IN_THIS_PROCESS, Stamps
 
-SCHEMA = STAGE_SCHEMA
 UNFINISHED = "unfinished"
 PARTS = "parts.json"
 
@@ -50,21 +50,20 @@ class StageWriter:
 
     Attributes:
         files: name -> what the manifest says of the file.
-        seen: name -> stamp that the file had before it was hashed (`workflow.artifacts.stamps`).
+        stamps: hashes of the files, for the next plan.
     """
 
     def __init__(self, directory: Path, provenance: dict[str, Any]):
         self.directory = directory
         self.provenance = provenance
         self.files: dict[str, dict[str, Any]] = {}
-        self.seen: dict[str, stamps.Stamp] = {}
+        self.stamps = Stamps()
         self.parts: dict[str, Any] = {}
+        self._earlier = _noted_parts(directory)
         if directory.is_symlink():
             raise links.refused(directory)
         with io.named(directory):
             io.make_folder(directory)
-            for part, note in _noted_parts(directory).items():
-                manifests.write(io.inside(directory, f"{UNFINISHED}/{part}.json"), note, settled=False)
             io.remove(directory / MANIFEST)
 
     def exr(
@@ -94,7 +93,7 @@ class StageWriter:
 
     def table(self, name: str, columns: dict[str, Any], units: dict[str, str] | None = None) -> None:
         """Write one table; (n, k) arrays become fixed-size lists."""
-        metadata = {"iif.schema": SCHEMA, "iif.stage": self.provenance["stage"]}
+        metadata = {"iif.schema": STAGE_SCHEMA, "iif.stage": self.provenance["stage"]}
         types = io.write_parquet(io.inside(self.directory, name), columns, metadata, settled=False)
         rows = len(np.asarray(next(iter(columns.values()))))
         self._record(name, kind="parquet", shape=[rows], channels=types, units=units or {}, colour_space="linear")
@@ -134,21 +133,18 @@ class StageWriter:
         """
         note = io.inside(self.directory, f"{UNFINISHED}/{part}.json")
         try:
-            done = manifests.part(manifests.sealed(note.read_bytes()))
+            done = manifests.part(manifests.sealed(io.read_record(note)) if note.exists() else self._earlier.get(part))
         except (OSError, manifests.Broken):
             return None
         if done["by"] != (by or self.provenance["fingerprint"]):
             return None
-        seen = {}
         for name, facts in done["files"].items():
             if not io.is_inside(self.directory, name):  # a forged note
                 return None
-            path = io.inside(self.directory, name)
-            seen |= stamps.look(self.directory, [name])
-            if not path.is_file() or io.sha256_of(path) != facts["sha256"]:
+            path = self.directory / name
+            if not path.is_file() or self.stamps.of(path) != facts["sha256"]:
                 return None
         self.files |= done["files"]
-        self.seen |= seen
         if by:
             self.parts[part] = done
         return done["facts"]
@@ -163,8 +159,7 @@ class StageWriter:
 
     def _record(self, name: str, **facts: Any) -> None:
         path = self.directory / name
-        self.seen |= stamps.look(self.directory, [name])
-        self.files[name] = {"sha256": io.sha256_of(path), "bytes": path.stat().st_size, **facts}
+        self.files[name] = {"sha256": self.stamps.of(path), "bytes": path.stat().st_size, **facts}
 
     def finish(self) -> None:
         """Remove the files that an earlier run left, flush all names to disk, then write the manifest and flush its name."""
@@ -178,8 +173,7 @@ class StageWriter:
             elif str(path.relative_to(self.directory)) not in kept:
                 path.unlink()
         io.flush_folders(self.directory)
-        manifests.write(self.directory / MANIFEST, {"schema": SCHEMA, **self.provenance, "files": self.files})
-        self.seen |= stamps.look(self.directory, [MANIFEST])
+        manifests.write(self.directory / MANIFEST, {"schema": STAGE_SCHEMA, **self.provenance, "files": self.files})
 
 
 def _noted_parts(directory: Path) -> dict[str, Any]:
@@ -187,10 +181,9 @@ def _noted_parts(directory: Path) -> dict[str, Any]:
     not in the manifest, which Snakemake removes before it starts a job."""
     try:
         noted = manifests.sealed(io.read_record(directory / PARTS)).get("parts")
-        parts = {name: manifests.part(note) for name, note in noted.items()} if isinstance(noted, dict) else {}
-        return parts if all(io.is_inside(directory, name) for name in parts) else {}
     except (OSError, manifests.Broken):
         return {}
+    return noted if isinstance(noted, dict) else {}
 
 
 def _write_bytes(path: Path, data: bytes) -> None:
@@ -198,7 +191,8 @@ def _write_bytes(path: Path, data: bytes) -> None:
 
 
 class StageReader:
-    """Reads a finished stage. Every file is checked against the manifest when it is opened.
+    """Reads a finished stage. Every file is checked against the manifest when it is opened; its content is hashed once in a
+    process, as long as nobody touches it. `digest` is the SHA-256 of the manifest.
 
     Raises:
         DamagedArtefact: the manifest is missing or of another schema, a file is missing or has another hash, or a value is not
@@ -211,9 +205,9 @@ class StageReader:
         if not path.is_file():
             raise DamagedArtefact(path, stage, scene, "missing, so this stage is not finished", unfinished=True)
         try:
-            self.manifest = manifests.read(path)
+            self.manifest, self.digest = manifests.load(path)
         except manifests.Broken as error:
-            raise DamagedArtefact(path, stage, scene, str(error), _quality_in(path)) from None
+            raise DamagedArtefact(path, stage, scene, str(error), quality_in(path)) from None
         of = {key: self.manifest.get(key, own) for key, own in (("stage", stage), ("scene", scene))}
         if of != {"stage": stage, "scene": scene}:
             problem = f"it belongs to stage {of['stage']} of scene {of['scene']}, and was put here"
@@ -246,7 +240,7 @@ class StageReader:
         size = path.stat().st_size
         if size != facts["bytes"]:
             raise self._damaged(path, f"{size} bytes on disk, {facts['bytes']} were written")
-        if io.sha256_of(path) != facts["sha256"]:
+        if IN_THIS_PROCESS.of(path) != facts["sha256"]:
             raise self._damaged(path, "its content changed since it was written (sha256 differs)")
         return path
 
@@ -294,10 +288,10 @@ def _raise_if_of_disk(error: Exception) -> None:
         raise error
 
 
-def _quality_in(path: Path) -> str | None:
+def quality_in(path: Path) -> str | None:
     """Return the quality that a broken manifest names, if that can still be read, for the command that makes the stage again."""
     try:
-        quality = json.loads(path.read_text())["quality"]
+        quality = json.loads(io.read_record(path))["quality"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return quality if isinstance(quality, str) and quality.isidentifier() else None

@@ -168,7 +168,7 @@ def _scene(scene: str, quality: str) -> _Scene:
         readers[stage] = StageReader(Path("results") / home / stage, stage, home)
     capture = CaptureReader(readers["capture"])
     if not capture.has_truth:
-        raise InputError(f"scene {scene}: no ground truth, so maps cannot be scored; built-in rooms and Mitsuba scenes have it")
+        raise InputError(f"scene {scene}: no ground truth, so maps cannot be scored; a folder scene with `truth/` has it")
     return _Scene(capture, readers["segmentation"])
 
 

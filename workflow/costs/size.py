@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from workflow import plugins
 from workflow.costs.work import SceneSize
 
 IMAGES = (".png", ".jpg", ".jpeg", ".exr")
@@ -16,8 +17,6 @@ MESHES = (".ply", ".obj", ".glb", ".serialized")
 BYTES_PER_FACE = 36
 """Of a mesh whose header does not say how many faces it has: a guess between binary and text, which is good enough because costs
 grow slowly with faces."""
-BUILTIN_FACES = 60_000
-"""Of a room that is made, before its faces are divided."""
 
 
 def size_of_capture(manifest: dict[str, Any]) -> SceneSize:
@@ -42,12 +41,10 @@ def estimate(document: dict[str, Any], files: list[Path]) -> SceneSize:
     source, capture = document["source"], document["capture"]
     box = capture["width"], capture["height"]
     bytes_ = {path: path.stat().st_size for path in files if path.is_file()}
-    rendered = float(capture["views"] * box[0] * box[1])
-    if source["kind"] == "builtin":
-        return SceneSize(capture["views"], rendered, BUILTIN_FACES * 4.0 ** source["quarterings"])
     faces = sum(_faces(path, size) for path, size in bytes_.items() if path.suffix.lower() in MESHES)
-    if source["kind"] == "mitsuba":
-        return SceneSize(capture["views"], rendered, faces)
+    rendered = plugins.function("SIZES", source["kind"])
+    if rendered:
+        return SceneSize(capture["views"], float(capture["views"] * box[0] * box[1]), rendered(source, faces))
     images = [path for path in bytes_ if path.suffix.lower() in IMAGES and not _is_extra(path)]
     views = min(capture["views"], max(len(images), 1))
     width, height = _picture(images[0], box) if images else box

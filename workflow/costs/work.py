@@ -24,7 +24,7 @@ class SceneSize:
         views: photographs.
         pixels: of all of them together, at the size that they are worked on.
         faces: of the mesh.
-        source_mb: size of the files that `capture` reads, in MB; 0 for rooms that are made.
+        source_mb: size of the files that `capture` reads, in MB; 0 where it renders the photographs.
         exact: whether these are counts of a finished capture, or estimates from settings and headers of files.
     """
 
@@ -55,17 +55,17 @@ def work_of(stage: str, settings: dict[str, Any], size: SceneSize) -> Work:
         the count `job` of 1, for what it costs to start, and `a_view`, the pixels of one photograph, which is what stages hold
         that work on one after the other.
     """
-    kind, counts = _STAGES[stage](settings, size)
+    kind, counts = (plugins.function("COSTS", stage) or _STAGES[stage])(settings, size)
     kind = plugins.replacement(stage, settings) or kind  # which nobody has measured
     a_view = size.pixels / max(size.views, 1) / MILLION
     return Work(kind, {"job": 1.0, "a_view": a_view, **{name: float(value) for name, value in counts.items()}})
 
 
 def _capture(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
-    made = settings["source"]["kind"] in ("builtin", "mitsuba")
+    of_plugin = plugins.function("COSTS", settings["source"]["kind"])
+    if of_plugin:
+        return of_plugin(settings, size)
     pixels, faces = size.pixels / MILLION, size.faces / MILLION
-    if made:
-        return settings["source"]["kind"], {"paths": pixels * settings["capture"]["samples"], "pixels": pixels, "faces": faces}
     return "photographs", {"pixels": pixels, "faces": faces, "source_mb": size.source_mb, "views": size.views / 100}
 
 
@@ -172,22 +172,6 @@ def _pixels_of(camera: dict[str, Any], size: SceneSize) -> float:
     return camera["frames"] * shape / MILLION
 
 
-def _relit_pictures(settings: dict[str, Any], size: SceneSize) -> dict[str, float]:
-    """Pixels of all pictures under new light, if the room has as many lamps as may shine alone."""
-    relit = settings["relit"]
-    lights = relit["lamps"] + relit["moved"] + (relit["environment"] is not None) + relit["spheres"]
-    pixels = lights * relit["views"] * size.pixels / max(size.views, 1) / MILLION
-    return {"paths": pixels * relit["samples"], "pixels": pixels, "faces": size.faces / MILLION}
-
-
-def _relit_truth(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
-    return settings["source"]["kind"], _relit_pictures(settings, size)
-
-
-def _relit_scores(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
-    return "all", _relit_pictures(settings, size)
-
-
 def _metrics(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     metrics = settings["metrics"]
     share = 1.0 if metrics["views"] == "all" else min(1.0, metrics["views"] / max(size.views, 1))
@@ -237,8 +221,6 @@ _STAGES = {
     "relight": _relight,
     "metrics": _metrics,
     "unwrap": _unwrap,
-    "relit_truth": _relit_truth,
-    "relit_scores": _relit_scores,
     "export": _export,
     "room": _room,
     "report": _report,

@@ -20,7 +20,7 @@ from workflow.batch import plan as batch_table
 from workflow.comparison import named as comparison
 from workflow.registry import SHARED
 from workflow.runtime import fingerprint as fingerprints
-from workflow.runtime import events, forecast, input_digests, native
+from workflow.runtime import events, forecast, native
 from workflow.runtime.attempts import RUN, written_out
 from workflow.status import table as status
 from workflow.relighting import copies
@@ -53,18 +53,6 @@ def or_stop(compute, *arguments):
         return compute(*arguments)
     except InputError as error:
         stop(error)
-
-
-def inputs_again(asked):
-    """`--config inputs=rehash`: every input file that is known is read whole, also where nothing seems to have changed."""
-    if asked is None or not workflow.is_main_process:
-        return
-    if asked != "rehash":
-        raise InputError(
-            f"--config inputs={asked}: the only value is rehash, which reads every known input file again"
-        )
-    for path in input_digests.rehash():
-        print(written_out(f"{path}: its content changed"), file=sys.stderr)
 
 
 # `--config`: a quality by name, or for each scene the one that a number of seconds or a score asks for.
@@ -127,7 +115,6 @@ for place in (".", "results", "scenes", ".snakemake"):
         )
 
 
-or_stop(inputs_again, config.get("inputs"))
 if config.get("events") is not None:
     # Jobs inherit it, also those that Snakemake starts on other machines, because it hands `--config` on to them.
     os.environ[events.VARIABLE] = or_stop(

@@ -403,44 +403,6 @@ use rule stage as common_scores with:
         "{wildcards.scene}: scores at shared views"
 
 
-# On demand: studies whose scores are of pictures under new light. The source is rendered once for all variants.
-use rule stage as relit_truth with:
-    input:
-        unpack(reads("relit_truth", "capture")),
-    pathvars:
-        stage="relit_truth",
-    resources:
-        **needs("relit_truth"),
-    params:
-        job=job("relit_truth"),
-    message:
-        "{wildcards.scene}: the source under new light"
-
-
-use rule stage as relit_scores with:
-    input:
-        unpack(
-            reads(
-                "relit_scores",
-                "capture",
-                "segmentation",
-                "base",
-                "emission",
-                "second_look",
-                "affines",
-                "relit_truth",
-            )
-        ),
-    pathvars:
-        stage="relit_scores",
-    resources:
-        **needs("relit_scores"),
-    params:
-        job=job("relit_scores"),
-    message:
-        "{wildcards.scene}: the result under new light, and its scores"
-
-
 # Shown by `snakemake --list`: snakefmt knows no docstrings in `use rule`.
 descriptions = {
     "capture": "Bring photographs, cameras and mesh into the normal form, or render them.",
@@ -461,8 +423,6 @@ descriptions = {
     "lamp_images": "Render the recovered scene with every lamp by itself; made on demand by relight.",
     "relight": "Render the recovered scene under other light, edited; made on demand.",
     "base_scores": "Score the base texture; made on demand by studies.",
-    "relit_truth": "Render the source of a scene with truth under new light; made on demand by studies.",
-    "relit_scores": "Render the result under new light and score it against the source; made on demand by studies.",
     "common_scores": "Score the result at views that all variants of a study share; made on demand by studies.",
 }
 # Later stages go first, so that the scenes of a batch are finished one after the other, and not all of them stage by stage.

@@ -10,12 +10,8 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib
-import importlib.util
 import json
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -23,7 +19,8 @@ from typing import Any
 from iif_core.errors import InputError
 from workflow import plugins
 from workflow import settings as settings_module
-from workflow.artifacts.files import read_record, sha256_of, write_json
+from workflow.artifacts.files import read_record, sha256_of
+from workflow.artifacts.stamps import Stamps
 from workflow.intake.names import shown
 from workflow.registry import STAGES
 from workflow.runtime import input_digests
@@ -67,83 +64,34 @@ def is_infrastructure(module: str) -> bool:
     return module in PACKAGES or any(module == name or module.startswith(name + ".") for name in INFRASTRUCTURE)
 
 
-_CODE = Path("results/.code-digests.json")
-_remembered: dict[str, list[Any]] = {}  # module -> [sha256 of its source, digest of its code, names that it imports]
-_unsaved = False
-_held = False
-_lock = threading.Lock()  # stages read their upstream from several threads
+CODE = Path("results/.code-digests.json")
+"""What was found of modules: parsing all of them takes longer than some stages."""
 
 
 @lru_cache(None)
-def _recall() -> None:
-    """Read what an earlier process found with the same version of Python and of this module."""
-    try:
-        document = json.loads(read_record(_CODE))
-        if document["by"] == _reader_of_code() and document["seal"] == _seal(document["modules"]):
-            _remembered.update(document["modules"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        pass
+def _code() -> Stamps:
+    return Stamps(CODE.absolute(), _found_in, f"{sys.version_info[:3]} {sha256_of(Path(__file__))}")
 
 
-def _seal(modules: dict[str, list[Any]]) -> str:
-    """Return a digest of what is kept of the code: a flipped bit would have every scene made again, and nobody would know why."""
-    return hashlib.sha256(json.dumps(modules, sort_keys=True).encode()).hexdigest()
-
-
-def _reader_of_code() -> str:
-    return f"{sys.version_info[:3]} {sha256_of(Path(__file__))}"
-
-
-def _save() -> None:
-    global _unsaved
-    with _lock:
-        if _unsaved and not _held:
-            write_json(_CODE, {"by": _reader_of_code(), "modules": _remembered, "seal": _seal(_remembered)})
-            _unsaved = False
-
-
-@contextmanager
-def unsaved() -> Iterator[None]:
-    """Write nothing within the block: neither what was found of code nor of input files."""
-    global _held
-    _held = True
-    try:
-        with input_digests.unsaved():
-            yield
-    finally:
-        _held = False
-
-
-@lru_cache(None)
-def _facts(module: str) -> tuple[str, tuple[str, ...]]:
-    """Return the digest of a module's code, and the names within our packages that it imports anywhere in its source.
-
-    Parsing all modules takes longer than some stages, so the result is kept in a file, keyed by the sha256 of the source.
-    """
-    global _unsaved
+def _facts(module: str) -> tuple[str, list[str]]:
+    """Return the digest of a module's code, and the names within our packages that it imports anywhere in its source."""
     path = module_file(module)
-    if path is None:
-        return "", ()
-    _recall()
-    source = sha256_of(path)
-    found = _remembered.get(module)
-    if found is None or found[0] != source:
-        tree = ast.parse(path.read_text(), str(path))
-        names = _imported(tree, module if path.name == "__init__.py" else module.rpartition(".")[0])
-        found = [source, _digest_of(tree), sorted(names)]
-        with _lock:
-            _remembered[module], _unsaved = found, True
-    return found[1], tuple(found[2])
+    return _code().of(path) if path else ("", [])
 
 
-def _imported(tree: ast.Module, package: str) -> set[str]:
+def _found_in(path: Path) -> tuple[str, list[str]]:
+    tree = ast.parse(path.read_text(), str(path))
+    return _digest_of(tree), sorted(_imported(tree))
+
+
+def _imported(tree: ast.Module) -> set[str]:
     out: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             out.update(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package) if node.level else node.module
-            out.update([base or "", *(f"{base}.{alias.name}" for alias in node.names)])
+        elif isinstance(node, ast.ImportFrom):  # no import here is relative
+            out.update([node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)])
+    # Whatever the plug-ins of this process are, because what was found is kept for others.
     return {name for name in out if (REPOSITORY / name.split(".")[0]).is_dir()}
 
 
@@ -226,12 +174,12 @@ def code_digest(stage: str, settings: dict[str, Any]) -> str:
 def modules_digest(modules: list[str]) -> str:
     """Return the digest of the code of some modules."""
     parts = [f"{module}:{_facts(module)[0]}" for module in modules]
-    _save()
+    _code().save()
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
 def raw_digest(paths: list[Path]) -> str:
-    """Return the digest of the contents of input files; large ones are treated as in workflow/runtime/input_digests.py."""
+    """Return the digest of the contents of input files."""
     return hashlib.sha256("\n".join(input_digests.digests(paths, _name_of)).encode()).hexdigest()[:16]
 
 

@@ -21,9 +21,9 @@ from typing import IO, Any, NamedTuple
 from iif_core.errors import InputError
 from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter, links, stamps
-from workflow.artifacts.files import read_record, sha256_of, write_json
+from workflow.artifacts.files import read_record, write_json
 from workflow.registry import SHARED, STAGES
-from workflow.runtime import device, events, forecast, input_digests
+from workflow.runtime import device, events, forecast
 from workflow.runtime import fingerprint as fp
 from workflow.settings import study_files
 
@@ -126,7 +126,6 @@ class Job:
     @cached_property
     def writer(self) -> StageWriter:
         """The writer of this stage's folder; it is finished after `run`."""
-        stamps.place(Path("results"), self.scene, self.stage.name).unlink(missing_ok=True)
         return StageWriter(stage_directory(self.scene, self.stage.name), self._provenance())
 
     def _provenance(self) -> dict[str, Any]:
@@ -136,7 +135,7 @@ class Job:
             name: {
                 "scene": reader.scene,
                 "fingerprint": reader.fingerprint,
-                "manifest_sha256": sha256_of(reader.directory / "manifest.json"),
+                "manifest_sha256": reader.digest,
             }
             for name, reader in readers.items()
         }
@@ -288,9 +287,7 @@ def run_stage(
         return
     importlib.import_module(fp.module_of(stage, job.document)).run(job)
     job.writer.finish()
-    stamps.stamp_stage(Path("results"), scene, stage, job.writer.seen)
-    if job.stage.reads_raw:
-        input_digests.remember(fp.raw_inputs(stage, job.document))
+    job.writer.stamps.save(stamps.place(Path("results"), scene, stage), flushed=True)
     job.write_timings()
 
 

@@ -11,11 +11,9 @@ Only the standard library is used, and importing this module changes nothing.
 from __future__ import annotations
 
 import ctypes
-import glob
 import importlib
 import importlib.util
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -27,16 +25,6 @@ from iif_core.errors import InputError
 
 OLDEST_LLVM = 16
 LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
-SYSTEM_FOLDERS = (
-    "/usr/lib/x86_64-linux-gnu",
-    "/usr/lib/aarch64-linux-gnu",
-    "/usr/lib64",
-    "/usr/lib64/llvm*/lib*",
-    "/usr/lib",
-    "/usr/lib/llvm-*/lib",
-    "/usr/local/lib",
-    "/opt/homebrew/opt/llvm*/lib",
-)
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "MKL_NUM_THREADS",
@@ -48,8 +36,6 @@ THREAD_VARIABLES = (
 SMALL_MATRICES = "OPENBLAS_NUM_THREADS"
 """Always 1: NumPy's and SciPy's matrices are small here, and threads that wait for one another doubled the CPU time of stages.
 Sums in another order would also make results depend on the number of threads."""
-_LIBRARY_NAME = re.compile(r"libLLVM(?:-[\d.]+)?\.(?:so|dylib)[\d.]*$")
-_NAMED_VERSION = re.compile(r"libLLVM[-.](?:so\.)?(\d+)")
 # LLVMGetVersion exists from LLVM 16 on: its absence is the answer "older".
 _ASK = """
 import ctypes, sys
@@ -69,54 +55,43 @@ class LlvmReport:
     Attributes:
         path: absolute path of the usable library, None if there is none.
         version: its major version, 0 if `path` is None.
-        candidates: every library found as (path, major version by its file name or 0), best first.
         problem: one line that says what was found, what is needed and what to do; None if `path` is usable.
     """
 
     path: str | None
     version: int
-    candidates: tuple[tuple[str, int], ...]
     problem: str | None
 
 
 def find_llvm(environment: Mapping[str, str] | None = None, folders: Sequence[str] | None = None) -> LlvmReport:
-    """Find an LLVM >= 16: `DRJIT_LIBLLVM_PATH` if set, else this environment's lib folder, else the system's.
+    """Find an LLVM >= 16: the one that `DRJIT_LIBLLVM_PATH` names, otherwise the one that is installed with this environment.
 
-    A variable that names an unusable library is a problem even where another library would do, because it was set on purpose and
-    every child process inherits it. Never raises.
+    A variable that names an unusable library is a problem, because it was set on purpose and every child process inherits it.
+    Never raises.
 
     Args:
         environment: by default `os.environ`.
-        folders: glob patterns of library folders, best first; by default `<sys.prefix>/lib`, `<sys.base_prefix>/lib` and
-            SYSTEM_FOLDERS.
+        folders: of libraries, best first; by default those of this environment and of the Python that it was made from.
     """
-    environment = os.environ if environment is None else environment
-    if folders is None:
-        own = dict.fromkeys(f"{glob.escape(p)}/lib" for p in (sys.prefix, sys.base_prefix))
-        folders = (*own, *SYSTEM_FOLDERS)
-    candidates = _libraries(folders)
-
-    chosen = environment.get(LLVM_VARIABLE, "")
+    chosen = (os.environ if environment is None else environment).get(LLVM_VARIABLE, "")
     if chosen:
-        chosen = os.path.abspath(os.path.expanduser(chosen))
-        version, reason = _version(chosen)
-        if reason is None:
-            return LlvmReport(chosen, version, candidates, None)
-        problem = f"{LLVM_VARIABLE} names {chosen}, {reason}; unset it or name an LLVM {OLDEST_LLVM} or newer"
-        usable = [path for path, named in candidates if named >= OLDEST_LLVM]
-        return LlvmReport(None, 0, candidates, problem + (f" such as {usable[0]}" if usable else ""))
-
+        path = os.path.abspath(os.path.expanduser(chosen))
+        version, reason = _version(path)
+        problem = f"{LLVM_VARIABLE} names {path}, {reason}; unset it or name an LLVM {OLDEST_LLVM} or newer"
+        return LlvmReport(None, 0, problem) if reason else LlvmReport(path, version, None)
+    if folders is None:
+        folders = [f"{prefix}/lib" for prefix in dict.fromkeys((sys.prefix, sys.base_prefix))]
+    paths = [os.path.realpath(f"{folder}/libLLVM.so") for folder in folders]
     reasons = []
-    for path, named in candidates:
-        version, reason = (named, f"which is LLVM {named}") if 0 < named < OLDEST_LLVM else _version(path)
+    for path in filter(os.path.exists, paths):
+        version, reason = _version(path)
         if reason is None:
-            return LlvmReport(path, version, candidates, None)
+            return LlvmReport(path, version, None)
         reasons.append(f"{path}, {reason}")
     found = "found only " + "; ".join(reasons) if reasons else "found no LLVM library"
     return LlvmReport(
         None,
         0,
-        candidates,
         f"{found}. Dr.Jit needs LLVM {OLDEST_LLVM} or newer (older ones abort the process): "
         f"run `bash envs/setup.sh`, which installs one without root, or set {LLVM_VARIABLE} to a libLLVM.so",
     )
@@ -196,24 +171,6 @@ def limit_threads(count: int) -> None:
         importlib.import_module("drjit").set_thread_count(count)
 
 
-def _libraries(folders: Sequence[str]) -> tuple[tuple[str, int], ...]:
-    """Return (path, version by name) of every libLLVM: folder by folder, newest first, links resolved."""
-    found: dict[str, int] = {}
-    for folder in folders:
-        here: dict[str, int] = {}
-        for path in glob.glob(f"{folder}/libLLVM*"):
-            real = os.path.realpath(path)
-            if _LIBRARY_NAME.match(os.path.basename(path)) and os.path.isfile(real) and real not in found:
-                here[real] = max(_named_version(real), _named_version(path))
-        found |= sorted(here.items(), key=lambda item: (-item[1], item[0]))
-    return tuple(found.items())
-
-
-def _named_version(path: str) -> int:
-    match = _NAMED_VERSION.match(os.path.basename(path))
-    return int(match[1]) if match else 0
-
-
 def _version(path: str) -> tuple[int, str | None]:
     """Return the major version that the library itself reports, and why it cannot be used (None if it can)."""
     if not os.path.exists(path):
@@ -225,8 +182,7 @@ def _version(path: str) -> tuple[int, str | None]:
     if error is not None:
         return 0, f"which cannot be loaded ({error})"
     if version < OLDEST_LLVM:
-        named = version or _named_version(os.path.realpath(path))
-        return version, f"which is LLVM {named or f'older than {OLDEST_LLVM}'}"
+        return version, f"which is LLVM {version or f'older than {OLDEST_LLVM}'}"
     return version, None
 
 

@@ -16,11 +16,8 @@ from workflow.settings.section import Section
 
 NOT_READ = {
     "affines.ridge": " It was removed, because it had no effect; delete it.",
-    "source.path": (
-        " Kind `builtin` is a room of the project and has no path; for your own data, set `source.kind` (column source)."
-    ),
 }
-"""Keys of earlier versions and of other kinds: what to do about them."""
+"""Keys of earlier versions: what to do about them."""
 SHOWN = 10
 """Problems in one message."""
 NEEDED = {
@@ -153,7 +150,7 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
             union = POOLED if "of" in where else UNIONS.get(str(where[0]), {})
             got = found.get("kind") if isinstance(found, dict) else found
             said = "missing. Add it;" if got is None else f"found {shown(got)},"
-            hint = did_you_mean(got, union) if got is not None else ""
+            hint = "" if got is None else did_you_mean(got, union) or " Plug-ins bring other kinds (IIF_PLUGINS)."
             lines.append(f"{path}: `{dotted}.kind`: {said} allowed: {', '.join(union)}.{hint}")
         elif kind == "value_error" and _is_section(found):  # keys that do not go together: the message says which
             lines.append(f"{path}: `{dotted}`: {problem['ctx']['error']}.")

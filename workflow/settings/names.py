@@ -8,6 +8,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+from workflow import plugins
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 QUALITIES = ("draft", "standard", "paper")
 DEFAULT = "draft"
@@ -49,14 +51,23 @@ def quality_names(root: Path = Path(".")) -> list[str]:
     return [*QUALITIES, *sorted(found - set(QUALITIES))]
 
 
+def _scene_folders(root: Path) -> list[Path]:
+    """Return the folders with scene files: that of the working folder, or those of the repository and of its plug-ins."""
+    first = configuration("scenes", root)
+    shipped = first.resolve() == REPOSITORY / "config/scenes"
+    added = plugins.scene_folders() if shipped else []
+    return [first, *(root / folder if (root / folder).is_dir() else REPOSITORY / folder for folder in added)]
+
+
 def scene_path(scene: str, root: Path = Path(".")) -> Path:
     """Return where the file of a scene lies, or would lie."""
-    return configuration("scenes", root) / f"{scene}.yaml"
+    paths = [folder / f"{scene}.yaml" for folder in _scene_folders(root)]
+    return next((path for path in paths if path.is_file()), paths[0])
 
 
 def scene_names(root: Path = Path(".")) -> list[str]:
     """Return the name of every scene that has a file, sorted."""
-    return sorted(path.stem for path in configuration("scenes", root).glob("*.yaml"))
+    return sorted({path.stem for folder in _scene_folders(root) for path in folder.glob("*.yaml")})
 
 
 def did_you_mean(name: object, known: Iterable[str], form: str = "{}") -> str:

@@ -31,27 +31,6 @@ class Metrics(Section):
     the paper. This needs weights (`snakemake --cores 1 results/weights/lpips_vgg.npz`) and triples the time of the stage."""
 
 
-class Relit(Section):
-    """Scores of pictures under new light, made by studies with `scores: relit_scores` (lab/docs/evaluation.md#relighting)."""
-
-    views: int = Field(3, ge=1)
-    """Views that are rendered under each light, spread evenly over all."""
-    lamps: int = Field(6, ge=0)
-    """At most this number of lamps shine alone, the strongest first."""
-    spheres: int = Field(3, ge=0)
-    """Positions of the glowing sphere on its path."""
-    moved: bool = True
-    """Whether the strongest lamp is moved."""
-    environment: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
-    """Uniform radiance from outside, all lamps off; null = none. A room without openings has no such picture."""
-    samples: int = Field(64, ge=1)
-    """Paths per pixel, of the source and of the recovered room alike."""
-    max_bounces: int = Field(8, ge=1, le=64)
-    """Longest path, in bounces."""
-    denoise: bool = True
-    """Denoise the pictures of both."""
-
-
 class Export(Section):
     """Files for other programs."""
 

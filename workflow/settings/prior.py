@@ -21,16 +21,6 @@ class PriorBase(Section):
     """Seed of the predictions alone; by default the seed of the scene. Without effect on `kind: files`."""
 
 
-class SimulatedPrior(PriorBase):
-    """Ground truth with errors like those of RGB-X. Needs a source with ground truth."""
-
-    kind: Literal["simulated"]
-    strength: float = Field(1.0, ge=0, le=4)
-    """Strength of the errors: 0 = ground truth; 1 = errors as large as the paper reports for RGB-X."""
-    shared: float = Field(1.0, ge=0, le=10)
-    """Factor on the errors of albedo that all views of an object share, which no fusion of predictions can remove."""
-
-
 class FilesPrior(PriorBase):
     """Maps that any model has made: `predictions/{albedo,roughness,metallic}/<view>_<kkk>.png|exr`."""
 
@@ -108,8 +98,9 @@ class MarigoldPrior(DiffusionPrior):
     """Longest side in pixels to which photographs are scaled for the model; by default as the checkpoint recommends (768)."""
 
 
-_MEMBERS = plugins.union("prior", LearnedPrior, RetinexPrior, FilesPrior, RgbxPrior, MarigoldPrior, SimulatedPrior)
-Member = Annotated[_MEMBERS, Field(discriminator="kind")]
+Member = Annotated[
+    plugins.union("prior", LearnedPrior, RetinexPrior, FilesPrior, RgbxPrior, MarigoldPrior), Field(discriminator="kind")
+]
 
 
 class PooledPrior(PriorBase):
@@ -132,7 +123,7 @@ class PooledPrior(PriorBase):
         return {**value, "of": [{**common, **one} if isinstance(one, dict) else one for one in members]}
 
 
-Prior = Annotated[_MEMBERS | PooledPrior, Field(discriminator="kind")]
+Prior = Annotated[get_args(Member)[0] | PooledPrior, Field(discriminator="kind")]
 
 
 def members(prior: dict[str, Any]) -> list[dict[str, Any]]:

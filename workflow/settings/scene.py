@@ -11,7 +11,6 @@ from workflow import plugins
 from workflow.settings import affines, base, light, outputs
 from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES
 from workflow.settings.limits import Limits
-from workflow.settings.outputs import Relit
 from workflow.settings.override import ByObject, Override
 from workflow.settings.prior import LearnedPrior, Member, Prior, predictions
 from workflow.settings.relight import Relightings, lamp_bases, recombines
@@ -60,7 +59,6 @@ class SceneSettings(Section):
     affines: Affines = Affines()
     render: Render = Render()
     metrics: Metrics = Metrics()
-    relit: Relit = Relit()
     export: Export = Export()
     report: Report = Report()
     room: Room = Room()

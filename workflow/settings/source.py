@@ -11,33 +11,6 @@ from workflow import plugins
 from workflow.settings.section import ON_OFF, Section
 
 
-class BuiltinSource(Section):
-    """A room that the project makes itself; nothing from outside is needed."""
-
-    kind: Literal["builtin"]
-    scene: Literal[
-        "kitchen", "matte", "tiny", "tiny-gloss", "tiny-black-metal", "tiny-white", "tiny-lamp",
-        "sky", "sun", "blinds", "curtains", "door", "lamps", "gloss", "white", "single", "evening",
-    ] = "kitchen"  # fmt: skip
-    """Which room (lab/docs/rooms.md): `kitchen` is furnished, `matte` the same without gloss and metal, `tiny` a few
-    boxes."""
-    quarterings: int = Field(0, ge=0, le=4)
-    """How often every face of its mesh is split into four. The room stays the same; a scan is finer, and costs more."""
-
-
-class MitsubaSource(Section):
-    """Any Mitsuba 3 scene; the workflow renders photographs, G-buffers and ground truth itself."""
-
-    kind: Literal["mitsuba"]
-    path: Path
-    """XML file of the scene."""
-    max_bounces: int = Field(16, ge=1, le=64)
-    """Longest path of the rendered photographs, in bounces."""
-    drop_transparent: bool = True
-    """Leave transparent (dielectric) surfaces out of the mesh, as a scan does. This is recorded, and pixels behind them are not
-    scored."""
-
-
 class PhotographedSource(Section):
     alignment: Annotated[Literal["check", "warn", "off"], ON_OFF] = "check"
     """Compare the projected mesh with depth images, sparse points or image edges; `check` refuses a mismatch and reports the
@@ -112,7 +85,7 @@ class FiptSource(PhotographedSource):
 
 
 Source = Annotated[
-    plugins.union("source", BuiltinSource, MitsubaSource, FolderSource, ScanNetppSource, FiptSource),
+    plugins.union("source", FolderSource, ScanNetppSource, FiptSource),
     Field(discriminator="kind"),
 ]
 

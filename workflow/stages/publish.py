@@ -51,14 +51,16 @@ def run(job: Job) -> None:
         "manifest_sha256": sha256_of(target / MANIFEST),
     }
     writer.json("published.json", published)
-    document = manifests.read(target / MANIFEST, SCENE_SCHEMA)
-    stamps.note(stamps.place(Path("results"), job.scene, stamps.DELIVERABLE), target, document, seen)
+    noted = stamps.Stamps()
+    for name, stamp in seen.items():
+        noted.note(target / name, stamp, files[name]["sha256"] if name in files else published["manifest_sha256"])
+    noted.save(stamps.place(Path("results"), job.scene, stamps.DELIVERABLE), flushed=True)
     job.log.info("%s: %d files, %.1f MB", target, len(files), sum(f["bytes"] for f in files.values()) / 1e6)
 
 
 def _build(
     job: Job, readers: dict[str, StageReader], temporary: Path
-) -> tuple[dict[str, dict[str, Any]], dict[str, stamps.Stamp]]:
+) -> tuple[dict[str, dict[str, Any]], dict[str, stamps.Stamp | None]]:
     """Fill the folder, its manifest last, and flush it to disk; return the files of the manifest, and the stamps of all."""
     with named(temporary):
         temporary.mkdir()
@@ -70,8 +72,8 @@ def _build(
     columns = {name: np.array([row[name] for row in timings], dtype) for name, dtype in TIMING_COLUMNS.items()}
     write_parquet(temporary / "timings.parquet", columns, {"iif.schema": SCENE_SCHEMA}, settled=False)
     names = sorted(path.relative_to(temporary).as_posix() for path in temporary.rglob("*") if path.is_file())
-    seen = stamps.look(temporary, names)
-    files = {name: {"sha256": sha256_of(temporary / name), "bytes": seen[name][0]} for name in names}
+    seen = {name: stamps.stamp_of(temporary / name) for name in names}
+    files = {name: {"sha256": sha256_of(temporary / name), "bytes": (temporary / name).stat().st_size} for name in names}
     for name, (reader, digest) in made.items():  # what is sealed here is what the stages have sealed, and not what became of it
         if files[name]["sha256"] != digest:
             raise InputError(
@@ -80,7 +82,7 @@ def _build(
             )
     manifests.write(temporary / MANIFEST, _manifest(job, files), settled=False)
     flush_folders(temporary)
-    return files, seen | stamps.look(temporary, [MANIFEST])
+    return files, seen | {MANIFEST: stamps.stamp_of(temporary / MANIFEST)}
 
 
 def deliverables(readers: dict[str, StageReader]) -> list[tuple[str, str]]:
@@ -118,7 +120,7 @@ def _manifest(job: Job, files: dict[str, Any]) -> dict[str, Any]:
         "quality": job.quality,
         "fingerprint": job.fingerprint,
         "fingerprints": {stage: job.read(stage).fingerprint for stage in job.stage.upstream},
-        "manifests": {stage: sha256_of(job.read(stage).directory / MANIFEST) for stage in job.stage.upstream},
+        "manifests": {stage: job.read(stage).digest for stage in job.stage.upstream},
         "settings": job.document,
         "versions": library_versions(),
         "files": files,

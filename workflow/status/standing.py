@@ -83,7 +83,7 @@ def survey(scenes: list[str], quality_of: Callable[[str], str], now: float) -> I
         now: the present time, as `time.time`.
     """
     unbegun = unfinished = 0
-    with fp.unsaved():
+    with stamps.unsaved():
         for scene in scenes:
             try:
                 found = _standing(scene, quality_of, now, unbegun < LOOKED_INTO)
@@ -253,20 +253,17 @@ def _is_current(document: dict[str, Any], touched: float, scene: str, quality: s
 def _changed(scene: str) -> str:
     """Return the name of a file of a deliverable that is missing, or whose size or time stamp changed since it was published;
     empty if there is none, or if the deliverable is a copy, whose time stamps say nothing."""
-    noted_of = stamps.load(stamps.place(Path("results"), scene, stamps.DELIVERABLE))
-    if noted_of is None or not _is_original(scene):
+    if not _is_original(scene):
         return ""
-    return next(iter(stamps.touched(Path("scenes") / scene, noted_of)), "")
+    noted_of = stamps.Stamps(stamps.place(Path("results"), scene, stamps.DELIVERABLE))
+    names = _document(f"scenes/{scene}/{MANIFEST}").get("files", {})
+    return next((name for name in names if noted_of.known(f"scenes/{scene}/{name}") is None), "")
 
 
 def _is_original(scene: str) -> bool:
     """Return whether the manifest of a deliverable has the time stamps that were noted when it was published."""
-    noted_of = stamps.load(stamps.place(Path("results"), scene, stamps.DELIVERABLE))
-    try:
-        now = stamps.stamp_of(os.stat(f"scenes/{scene}/{MANIFEST}"))
-    except OSError:
-        return False
-    return noted_of is not None and noted_of.files.get(MANIFEST) == now
+    noted_of = stamps.Stamps(stamps.place(Path("results"), scene, stamps.DELIVERABLE))
+    return noted_of.known(f"scenes/{scene}/{MANIFEST}") is not None
 
 
 @lru_cache(None)

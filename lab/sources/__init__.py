@@ -1,0 +1,1 @@
+"""Sources with ground truth: one module a kind (lab/plugins.py)."""
