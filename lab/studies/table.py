@@ -146,7 +146,7 @@ def _rows(name: str, study: Study, cell: Cell, quality: str) -> list[dict[str, A
         "scene": cell.scene,
         "variant": cell.variant,
         "label": variant.label or cell.variant,
-        "settings": json.dumps(variant.layer, sort_keys=True),
+        "settings": json.dumps({**variant.overrides, **({"preset": variant.preset} if variant.preset else {})}, sort_keys=True),
         "seed": cell.seed,
         **(_costs(cell, quality, study.costs) if not variant.row else {}),
         "status": "ok",

@@ -138,8 +138,6 @@ def test_settings_take_ids_and_refuse_the_rest():
     ):
         with misset(*fault):
             settings_of(bad)
-    with misset("", "value_error", "materials", "affines: {model: objects, solver: direct}"):
-        settings_of({"door": {"metallic": 0}}, affines={"model": "fipt"})
 
 
 def test_only_the_fit_and_what_follows_it_read_them():

@@ -41,12 +41,10 @@ def test_wall_time_follows_threads():
     assert model.predict("render", Work("new", {"job": 1.0}), 2, 1.0, fits) == (None, None, None, None)
 
 
-@pytest.mark.parametrize("preset", ["ours", "published", "published_repaired"])
 @pytest.mark.parametrize("quality", ["draft", "standard", "paper"])
-def test_every_stage_has_work(repository, tmp_path, preset, quality):
+def test_every_stage_has_work(repository, tmp_path, quality):
     (tmp_path / "config/scenes").mkdir(parents=True)
-    source = "source: {kind: builtin, scene: kitchen}\nprior: {kind: simulated}\n"
-    (tmp_path / "config/scenes/x.yaml").write_text(f"{source}preset: {preset}\n")
+    (tmp_path / "config/scenes/x.yaml").write_text("source: {kind: builtin, scene: kitchen}\nprior: {kind: simulated}\n")
     document = settings.dump(settings.load("x", quality, tmp_path))
     for stage in STAGES:
         work = work_of(stage, document, ROOM)

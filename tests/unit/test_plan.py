@@ -141,10 +141,3 @@ def test_the_plan_says_how_to_turn_it_over():
 
 def test_a_probe_that_finds_nothing_in_enough_rows_leaves_the_part_out():
     assert plan.specular("auto", Evidence(0.0, 0.0, 900))["included"] is False
-
-
-def test_the_published_method_is_not_planned():
-    of = {item["component"]: item for item in plan.not_planned()}
-    assert of["specular"]["status"] == SETTLED and of["environment"]["status"] == PROVISIONAL
-    later = plan.later(False, True, set(of))
-    assert not {item["component"] for item in later} & set(of)

@@ -34,9 +34,7 @@ def scene(tmp_path):
     ("text", "pixels", "noise"),
     [
         ("affines: {pixels: 5000}", 5000, 0.2),
-        ("affines: {model: object_mean}", 200_000, 0.2),
         ("affines: {texture: photographs}", "all", 0.1),
-        ("affines: {model: fipt}", "all", 0.1),
         ("shading: {pixels: all}", "all", 0.2),
         ("shading: {pixels: 300000}", 300_000, 0.2),
     ],
@@ -59,7 +57,6 @@ def test_noise_of_the_light_can_be_set(scene):
     ("text", "names"),
     [
         ("shading: {pixels: 1000}\naffines: {pixels: 5000}", ["shading: pixels", 1000, "affines: pixels", "`5000`"]),
-        ("shading: {pixels: 1000}\naffines: {model: iris}", ["shading: pixels", 1000, "affines: model: iris", "`all`"]),
         ("shading: {pixels: 1000}\naffines: {texture: photographs}", ["shading: pixels", 1000, "texture", "`all`"]),
         ("shading: {pixels: some}", ["shading.pixels", "'some'", "'auto', 'all'", 100]),
         ("shading: {pixels: 5}", ["shading.pixels", 5, "'auto', 'all'", 100]),
@@ -104,24 +101,13 @@ def test_scene_over_preset_over_default(scene):
         (GOOD + "affines: {scale: {mean_albedo: 3}}\n", ["affines.scale.mean_albedo", 3, 1]),
         ("source: {kind: mitsuba, path: 3}\nprior: {kind: simulated}\n", ["source.path", 3]),
         ("source: {kind: builtn}\nprior: {kind: simulated}\n", ["source.kind", "'builtn'", "builtin"]),
-        (f"{GOOD}affines: {{solver: dirct}}\n", ["affines.solver", "'dirct'", "direct"]),
+        (f"{GOOD}affines: {{response: srg}}\n", ["affines.response", "'srg'", "srgb"]),
         (f"{GOOD}affines: {{pixels: some}}\n", ["affines.pixels", "'some'", "'all'", 100]),
         ("prior: {kind: simulated}\n", ["source", "config/scenes/kitchen.yaml"]),
         ("source: {kind: builtin\n", ["line 2", "YAML"]),
         ("- a\n- b\n", ["list", "key: value"]),
         (GOOD + "capture: {views: 3, views: 5}\n", ["line 3", "`views`"]),
         ("source: builtin\nprior: {kind: simulated}\n", ["source", "'builtin'", "source: {kind: ...}"]),
-        (GOOD + "base: {iterations: 100}\n", ["`base`", "`iterations`", "solver: sgd", "solver: direct"]),
-        (GOOD + "base: {solver: sgd, sweeps: 3}\n", ["`base`", "`sweeps`", "solver: direct", "solver: sgd"]),
-        (GOOD + "emission: {iterations: 5}\n", ["`emission`", "`iterations`", "solver: sgd", "solver: direct"]),
-        (GOOD + "emission: {preset: paper}\n", ["`emission`", "`preset`", "solver: sgd"]),
-        (GOOD + "affines: {epochs: 5, rate: 1}\n", ["`affines`", "`epochs`, `rate`", "solver: sgd"]),
-        (
-            GOOD + "affines: {solver: adam, robust_width: 1}\n",
-            ["`affines`", "`robust_width`", "solver: direct", "solver: adam"],
-        ),
-        (GOOD + "affines: {model: fipt, scale: prior}\n", ["`affines`", "`scale`", "model: objects", "model: fipt"]),
-        (GOOD + "affines: {model: iris, solver: adam, epochs: 9}\n", ["`affines`", "`epochs`", "model: objects", "model: iris"]),
         (GOOD + "metrics: {views: 0}\n", ["metrics.views", 0, 1]),
         (GOOD + "affines: {ridge: 0.1}\n", ["affines.ridge"]),
         (GOOD + "base: {predictions: 99}\n", ["base: predictions", 99, "`prior`", 8]),
@@ -149,32 +135,16 @@ def test_scene_file_that_is_not_utf8(scene):
         settings.load("x", "draft", root)
 
 
-def test_a_value_that_equals_the_default_is_never_idle(scene):
-    root = scene(GOOD + "affines: {model: fipt, iterations: 60}\nbase: {solver: sgd, sweeps: 9}\n")
-    assert settings.load("x", "draft", root).affines.iterations == 60
-
-
-def test_a_choice_drops_what_lower_layers_set_for_the_other_one(scene):
-    """A preset that sets a number for the direct solver must not forbid a scene to use another solver."""
-    root = scene(GOOD + "affines: {solver: sgd}\n", "affines: {iterations: 7, pixels: 500}\n")
-    got = settings.load("x", "draft", root).affines
-    assert (got.solver, got.iterations, got.pixels) == ("sgd", 60, 500)
-
-
 def test_defaults_are_those_of_the_solvers(repository):
     from iif_core.fitting.problem import FitOptions
-    from iif_core.fitting.sgd import SgdOptions
-    from iif_core.light.emission import sgd
 
     tree = settings.SceneSettings(source={"kind": "builtin"}, prior={"kind": "simulated"})
     for section, options in (
         (tree.affines, FitOptions()),
-        (tree.affines, SgdOptions()),
         (tree.base, FusionOptions()),
     ):
         shared = set(type(section).model_fields) & {field.name for field in fields(options)}
         assert {name: getattr(section, name) for name in shared} == {name: getattr(options, name) for name in shared}
-    assert tree.emission.preset == sgd.SgdOptions().preset
 
 
 def test_a_folder_without_configuration_uses_that_of_the_repository(tmp_path, repository):
@@ -242,41 +212,6 @@ def test_registry_is_ordered_and_its_settings_exist(repository):
         settings.select(document, stage.settings)
 
 
-def test_a_preset_lies_below_the_file_that_names_it(scene):
-    root = scene(GOOD + "preset: published\nemission: {iterations: 7}\n", "affines: {pixels: 500}\nemission: {samples: 4}\n")
-    got = settings.load("x", "draft", root)
-    solvers = got.base.solver, got.emission.solver, got.affines.solver
-    assert (got.preset, *solvers) == ("published", "sgd", "published", "published")
-    assert (got.emission.samples, got.emission.iterations, got.affines.pixels, got.shading.pixels) == (128, 7, "all", "all")
-    repaired = settings.load("x", "draft", scene(GOOD + "preset: published_repaired\n"))
-    assert (repaired.base.preset, repaired.base.texture, repaired.emission.solver) == ("safe", "hashgrid", "published_repaired")
-
-
-def test_a_setting_of_ours_beside_a_preset_is_idle(scene):
-    with refused("emission", "prune", "solver: direct", "sgd", "solver: published"):
-        settings.load("x", "draft", scene(GOOD + "preset: published\nemission: {prune: 0.2}\n"))
-    with refused("shading", "levels", "method: shared_paths", "method: published"):
-        settings.load("x", "draft", scene(GOOD + "preset: published\nshading: {levels: 4}\n"))
-    with refused("emission: solver: published", "affines: response"):
-        settings.load("x", "draft", scene(GOOD + "preset: published\naffines: {response: {file: c.csv}}\n"))
-    with refused("emission: solver: published", "capture: {dynamic_range: ldr}"):
-        settings.load("x", "draft", scene(GOOD + "preset: published\ncapture: {dynamic_range: hdr}\n"))
-    with refused("preset", "'theirs'", "'published'"):
-        settings.load("x", "draft", scene(GOOD + "preset: theirs\n"))
-
-
-def test_mistakes_beside_a_preset_are_those_of_the_file_that_names_it(scene):
-    for text, names in (
-        ("capture: {dynamic_range: hdr}\n", ["capture: {dynamic_range: ldr}"]),
-        ("emission: {prune: 0.2}\n", ["prune"]),
-    ):
-        with refused("config/scenes/x.yaml", *names):
-            settings.load("x", "draft", scene(GOOD + "preset: published\n" + text))
-    root = scene(GOOD + "affines: {model: no_such}\n", "preset: published\n")  # the quality names it
-    with refused("config/scenes/x.yaml", "affines.model", "'no_such'"):
-        settings.load("x", "draft", root)
-
-
 def test_yaml_is_read_alike_with_and_without_libyaml(tmp_path, monkeypatch):
     """An anchor is written out, a key that stands twice or merges another mapping is refused, and what is wrong is named."""
     path, found = tmp_path / "x.yaml", []
@@ -318,10 +253,6 @@ def test_a_forced_component_is_the_setting_of_its_own(scene, words, section, key
         ("components: {metallic: on}", ["components.metallic", "'on'", "'auto' or 'off'"]),
         ("components: {gloss: off}", ["components.gloss", "specular"]),
         ("components: {specular: maybe}", ["components.specular", "'maybe'", "'auto', 'on' or 'off'"]),
-        (
-            "capture: {dynamic_range: ldr}\npreset: published\ncomponents: {specular: off}",
-            ["components: specular"],
-        ),
     ],
 )
 def test_an_override_that_cannot_be(scene, text, names):

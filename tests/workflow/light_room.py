@@ -349,9 +349,6 @@ EMISSION = {
     "samples": 16,
     "prune": 0.01,
     "environment": "auto",
-    "solver": "direct",
-    "preset": "safe",
-    "iterations": 2000,
 }
 SHADING = {
     "pixels": "all",
@@ -360,11 +357,10 @@ SHADING = {
     "cell_edge": 0.05,
     "noise": 0.15,
     "max_samples": 512,
-    "method": "shared_paths",
     "max_bounces": 6,
     "indirect": "auto",
 }
 AFFINES = {
-    **{"model": "objects", "solver": "direct", "response": "auto", "iterations": 60, "pixels": 200000, "population": True},
-    **{"ridge": 2e-3, "robust_width": 0.1, "scale": "found", "texture": "base", "epochs": 3, "batch": 32768, "rate": None},
+    **{"response": "auto", "iterations": 60, "pixels": 200000, "population": True},
+    **{"ridge": 2e-3, "robust_width": 0.1, "scale": "found", "texture": "base"},
 }

@@ -139,13 +139,6 @@ def matte_by_predictions(provisional: Decision, lowest_roughness: float, metal: 
     return {**provisional, **settled}
 
 
-def not_planned() -> list[Decision]:
-    """Return the components of the published method, which decides about them itself."""
-    names = ("environment", "emitters", "radiance_cache", "metallic", "affine_size", "denoiser")
-    out = [not_probed(name, True, "the published method is not planned", PROVISIONAL) for name in names]
-    return [*out, not_probed("specular", True, "the published method traces all lobes", SETTLED)]
-
-
 OVERRIDDEN = ("environment", "specular", "metallic", "radiance_cache", "denoiser")
 """Components that the settings can force (`components: {...}`)."""
 

@@ -23,7 +23,7 @@ BESIDE_MB = 150
 TIME_MARGIN, TIME_LEAST = 4.0, 10
 """A scheduler ends a job that takes longer than it said, so this is generous, and minutes."""
 UNKNOWN_MEMORY, UNKNOWN_MINUTES, UNKNOWN_DISK = 12_000, 720, 20_000
-"""Of kinds of jobs that nobody has measured yet: priors that are networks, and segmentation by masks of a network."""
+"""Of kinds of jobs that nobody has measured yet: networks as priors or for masks, stages of plug-ins."""
 START, START_OF_JOB = 5.0, 0.9
 """Wall seconds that Snakemake takes to start, and that the start of a job adds to what the job measures itself."""
 COMPILATION = {"base": 15.0, "affines": 15.0}

@@ -2,8 +2,7 @@
 
 Order of precedence: defaults in this package < `config/quality/<quality>.yaml` < `config/scenes/<scene>.yaml`; for a variant of a
 study (study_files.py) also < `config/studies/scenes.yaml` < `config/studies/<study>.yaml`; for a line of `config/batch.tsv`
-(batch_table.py) its base takes the place of the file of the scene, under the columns of the line. The file of a `preset`,
-`config/presets/<preset>.yaml`, lies right below the uppermost layer that names one. `names.configuration` says when
+(batch_table.py) its base takes the place of the file of the scene, under the columns of the line. `names.configuration` says when
 these files are those of the working folder and when those of the repository. Nothing else is consulted: no environment variables,
 no hidden files.
 """

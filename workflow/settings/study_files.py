@@ -13,7 +13,7 @@ import itertools
 import re
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from pydantic import ConfigDict, Field, ValidationError
 
@@ -53,13 +53,24 @@ class Variant(Section):
     """Label in tables and pictures; by default the name of the variant."""
     overrides: dict[str, dict[str, Any]] = {}
     """Settings, section by section, over those of the scene."""
-    preset: Literal["ours", "published", "published_repaired"] | None = None
-    """Another method, as `preset` of a scene; by default what the scene has."""
+    preset: str | None = Field(None, pattern=r"^[a-z][a-z0-9_]*$")
+    """Settings under these, shared by studies: `config/studies/presets/<preset>.yaml`."""
 
-    @property
-    def layer(self) -> dict[str, Any]:
-        """All that the variant sets over the scene."""
-        return {**self.overrides, "preset": self.preset} if self.preset else dict(self.overrides)
+    def layer(self, root: Path) -> dict[str, dict[str, Any]]:
+        """Return all that the variant sets over the scene.
+
+        Raises:
+            InputError: there is no such preset.
+        """
+        if self.preset is None:
+            return dict(self.overrides)
+        file = configuration(f"studies/presets/{self.preset}.yaml", root)
+        if not file.is_file():
+            known = sorted(path.stem for path in file.parent.glob("*.yaml"))
+            hint = did_you_mean(self.preset, known)
+            raise InputError(f"{FOLDER}/presets/{self.preset}.yaml: not found.{hint} Known presets: {', '.join(known)}.")
+        below = read_yaml(file)
+        return {**below, **{section: {**below.get(section, {}), **keys} for section, keys in self.overrides.items()}}
 
 
 class Design(Section):
@@ -275,7 +286,7 @@ def layers(parts: Derived, root: Path = Path(".")) -> list[tuple[str, dict[str, 
             )
         if study.common:
             out.append((f"{FOLDER / parts.study}.yaml, `common`", study.common))
-        out.append((f"{FOLDER / parts.study}.yaml, variant {parts.variant}", study.variants[parts.variant].layer))
+        out.append((f"{FOLDER / parts.study}.yaml, variant {parts.variant}", study.variants[parts.variant].layer(root)))
     return [*out, ("seed of the study", {"prior": {"seed": parts.seed}})]
 
 

@@ -16,16 +16,12 @@ from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import Gauge, apply_gauge
 from iif_core.fitting.object_levels import level_deviation, prediction_scatter
 from iif_core.fitting.predictions import PredictionErrors
-from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, SgdOptions, albedo_uncertainty
-from iif_core.fitting.published import PublishedOptions, PublishedState, fit_published
-from iif_core.fitting.reference_loss import reference_loss
-from iif_core.fitting.sgd import fit_affines_sgd
+from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, albedo_uncertainty
 from iif_core.reflectance.material import CHANNELS, NUMBERS_OF, apply_affines
 from workflow.artifacts.scratch import Joined
 from workflow.artifacts.store import ids_from_disk, split_rgb
 from workflow.decisions import camera, materials, numerics
 from workflow.decisions.record import Decision
-from workflow.fitting import baselines
 from workflow.fitting.cell_textures import CellTextures
 from workflow.fitting.fit_pixels import FitPixels, count_eligible
 from workflow.fitting.inputs import balanced, cells_of, exposure_and_balance, roughness_levels
@@ -46,81 +42,73 @@ from workflow.scene.recovered import object_names, write_response
 from workflow.settings import scene_origin
 from workflow.settings.affines import KnownLamp
 
+Solver = Callable[[FitProblem, Response], FitResult]
+"""From the problem and the response of stage emission to the fit, in the gauge of the given light."""
+
 
 def run(job: Job) -> None:
     """Write objects.parquet, camera_response.parquet (LDR), cells.parquet, maps/<view>.exr and affines.json."""
-    if job.settings.affines.model != "objects":
-        return baselines.run(job)
+    fit(job, _direct)
+
+
+def fit(
+    job: Job,
+    solver: Callable[[Job, tuple[np.ndarray, np.ndarray] | None], Solver],
+    name: str = "direct",
+    draw: Callable[[Job, CaptureReader, BaseScene, np.ndarray], FitPixels] | None = None,
+    merged: bool = False,
+) -> None:
+    """Fit one affine map for each object and write the artefacts of the stage.
+
+    Args:
+        job: the job.
+        solver: makes the solver from the settings, and mean and precision of the response; name: of it, for affines.json.
+        draw: chooses the pixels, given the faces (m,) bool whose pixels are left out; None: evenly over the objects.
+        merged: read the mean of the two halves of the light, for a solver that does not ask how far they are apart.
+    """
     capture, (scene, light) = CaptureReader(job.read("capture")), read_lit_scene(job)
     names = object_names(job, scene.n_objects)
     find_gauge, given = _gauge(job, capture, names), _given(job, names)  # wrong settings stop the stage before any work
     mixed = light.emits | scene.is_sheer
-    problem, places = _problem(job, capture, scene, mixed, read_gains(job))
+    drawn = (draw or _drawn)(job, capture, scene, mixed)
+    problem, places = _problem(job, capture, scene, drawn, read_gains(job), merged)
     problem = replace(problem, given=given)
     start, prior, calibration = _starting_response(job)
     job.log.info("%d pixels of %d objects", len(problem.object_id), len(np.unique(problem.object_id)))
     textures = CellTextures.of(job, capture, scene, mixed)
-    fit, free = _fitted(job, problem, start, prior, places, find_gauge)
+    with job.timed("solve"):
+        free = solver(job, prior)(problem, start)
+    found = apply_gauge(problem, free, find_gauge(problem, places))
     for o in range(scene.n_objects):
-        job.log.debug("%s: %s, residual %.4f", names[o], fit.model[o], fit.residual[o])
-    _write_objects(job, names, fit, given)
+        job.log.debug("%s: %s, residual %.4f", names[o], found.model[o], found.residual[o])
+    _write_objects(job, names, found, given)
     if not capture.is_hdr:
-        write_response(job, fit.response)
-    albedo = textures.albedo(fit) if textures is not None else None
-    _write_cells(job, fit, albedo)
-    _write_maps(job, capture, fit, albedo)
+        write_response(job, found.response)
+    albedo = textures.albedo(found) if textures is not None else None
+    _write_cells(job, found, albedo)
+    _write_maps(job, capture, found, albedo)
     metals = job.settings.components.metallic
-    plan = _plan(problem, fit, calibration, capture.facts["dynamic_range"], metals)
+    plan = _plan(problem, found, calibration, capture.facts["dynamic_range"], metals)
     if given is not None:
         plan.append(materials.given_by_hand(names, given))
-    loss = reference_loss(problem, free.affine, free.response)
-    _write_facts(job, fit, loss.__dict__, plan)
+    _write_facts(job, name, found, plan)
 
 
-def _fitted(
-    job: Job,
-    problem: FitProblem,
-    start: Response,
-    prior: tuple[np.ndarray, np.ndarray] | None,
-    places: _Places,
-    find_gauge: Callable[[FitProblem, _Places], Gauge],
-) -> tuple[FitResult, FitResult]:
-    """Return the fit in its gauge, and in the gauge of the given light."""
-    with job.timed("solve"):
-        free = _solver(job, prior)(problem, start)
-    return apply_gauge(problem, free, find_gauge(problem, places)), free
-
-
-def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Callable[[FitProblem, Response], FitResult]:
-    """Return the solver that the settings name; `prior` is mean and precision of the response."""
+def _direct(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Solver:
     settings = job.settings.affines
-    if settings.solver == "direct":
-        options = FitOptions(
-            iterations=settings.iterations,
-            population=settings.population,
-            robust_width=settings.robust_width,
-            response_prior=prior,
-            # This prior read the brightness of objects from the same photographs.
-            base_tells_levels=job.settings.prior.kind != "retinex",
-            lobes=has_lobes(job),
-            metals=job.settings.components.metallic != "off",
-            prediction_errors=_prediction_errors(job),
-            threads=job.threads,
-        )
-        return lambda problem, start: fit_affines(problem, start, options)
-    if settings.solver == "published":
-        rate = PublishedOptions.rate if settings.rate is None else settings.rate
-        published = PublishedOptions(rate, epochs=settings.epochs, batch=settings.batch, seed=job.seed)
-        kept = job.kept_state("descent")
-        at = kept and PublishedState(**kept[0], step=kept[1]["step"], loss=tuple(kept[1]["loss"]))
-
-        def keep(state: PublishedState) -> None:
-            facts = {"step": state.step, "loss": list(state.loss)}
-            job.keep_state("descent", {"affine": state.affine, "params": state.params}, facts)
-
-        return lambda problem, start: fit_published(problem, start, published, at, keep)
-    own = SgdOptions(settings.solver, settings.rate, settings.epochs, settings.batch, seed=job.seed)
-    return lambda problem, start: fit_affines_sgd(problem, start, own)
+    options = FitOptions(
+        iterations=settings.iterations,
+        population=settings.population,
+        robust_width=settings.robust_width,
+        response_prior=prior,
+        # This prior read the brightness of objects from the same photographs.
+        base_tells_levels=job.settings.prior.kind != "retinex",
+        lobes=has_lobes(job),
+        metals=job.settings.components.metallic != "off",
+        prediction_errors=_prediction_errors(job),
+        threads=job.threads,
+    )
+    return lambda problem, start: fit_affines(problem, start, options)
 
 
 def _prediction_errors(job: Job) -> PredictionErrors | None:
@@ -133,7 +121,7 @@ def _prediction_errors(job: Job) -> PredictionErrors | None:
     return errors.of_second_look() if read_base(job).stage == "second_look" else errors
 
 
-def _write_facts(job: Job, fit: FitResult, loss: dict[str, float], plan: list[Decision]) -> None:
+def _write_facts(job: Job, solver: str, fit: FitResult, plan: list[Decision]) -> None:
     """Write affines.json."""
     spread = np.sqrt(np.clip(np.diagonal(fit.response_covariance), 0.0, None))
     weight = np.maximum(fit.pixels, 1e-9)
@@ -141,7 +129,7 @@ def _write_facts(job: Job, fit: FitResult, loss: dict[str, float], plan: list[De
     job.writer.json(
         "affines.json",
         {
-            "solver": job.settings.affines.solver,
+            "solver": solver,
             "light_scale": float(fit.light_scale),
             "numerics": numerics.of_affines(facts.pop("numerics", {}), bool(fit.converged)),
             **facts,
@@ -149,7 +137,6 @@ def _write_facts(job: Job, fit: FitResult, loss: dict[str, float], plan: list[De
             "converged": bool(fit.converged),
             "iterations": int(fit.iterations),
             "stopped": fit.reason,
-            "reference_loss": loss,
             "pixels": int(fit.pixels.sum()),
             "residual": float(np.sqrt(np.average(fit.residual**2, weights=weight))) if len(fit.pixels) else 0.0,
             "response": {**response_facts(fit.response), "std": spread.tolist(), "covariance": fit.response_covariance.tolist()},
@@ -266,23 +253,24 @@ def _starting_response(job: Job) -> tuple[Response, tuple[np.ndarray, np.ndarray
     return start, (start.params.ravel(), np.linalg.inv(np.asarray(known["covariance"], np.float64))), known
 
 
+def _drawn(job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray) -> FitPixels:
+    """Draw the pixels of the fit evenly over the objects (docs/method/fitting.md#which-pixels)."""
+    asked, counts = job.settings.affines.pixels, np.zeros(max(scene.n_objects, 1), np.int64)
+    for view in capture.used:
+        counts += count_eligible(view_pixels(job, capture, scene, view), mixed, scene.n_objects)
+    return FitPixels.evenly(counts, int(counts.sum()) if asked == "all" else asked, mixed, job.seed)
+
+
 def _problem(
-    job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray, gains: CameraGains
+    job: Job, capture: CaptureReader, scene: BaseScene, drawn: FitPixels, gains: CameraGains, merged: bool
 ) -> tuple[FitProblem, _Places]:
-    """Draw the pixels of the fit evenly over objects and read their cached shading (docs/method/fitting.md#which-pixels)."""
-    views, asked, published = capture.used, job.settings.affines.pixels, job.settings.affines.solver == "published"
-    if published and asked == "all":
-        drawn = FitPixels.every(scene.n_objects, mixed)
-    else:
-        counts = np.zeros(max(scene.n_objects, 1), np.int64)
-        for view in views:
-            counts += count_eligible(view_pixels(job, capture, scene, view), mixed, scene.n_objects)
-        drawn = FitPixels.evenly(counts, int(counts.sum()) if asked == "all" else asked, mixed, job.seed)
+    """Read the pixels of the fit with their cached shading."""
+    views = capture.used
     levels = roughness_levels(job)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("object", "value", "exposure", "view", "index", "cell")}
-    # What grows with pixels x levels is joined on disk; the published fit takes the mean of the halves.
-    folder = job.writer.directory
-    base, cached = Joined(folder), [[Joined(folder) for _ in range(3)] for _ in range(1 if published else 2)]
+    # What grows with pixels x levels is joined on disk.
+    folder, halves = job.writer.directory, (slice(None),) if merged else (slice(1), slice(1, 2))
+    base, cached = Joined(folder), [[Joined(folder) for _ in range(3)] for _ in halves]
     for done, view in enumerate(views):
         pixels, specular = view_pixels(job, capture, scene, view), read_specular(job, view)
         pixels = pixels.take(drawn.of(pixels, view))
@@ -296,7 +284,7 @@ def _problem(
         rows["index"].append(index.astype(np.int32))
         rows["cell"].append(cells_of(job, view)[index])
         specular, diffuse = specular.at(index), read_diffuse(job, view).reshape(2, -1, 3)[:, index]
-        for layers, half in zip(cached, (slice(None),) if published else (slice(1), slice(1, 2)), strict=True):
+        for layers, half in zip(cached, halves, strict=True):
             for layer, part in zip(layers, (diffuse, specular.s0, specular.s1), strict=True):
                 layer.add(balanced(part[half].mean(0), balance))
         job.progress(done + 1, len(views), "views read")
@@ -315,7 +303,7 @@ def _problem(
         value,
         joined["exposure"],
         saturated,
-        None if published else _patches(scene, object_id, joined["cell"].astype(np.int64)),
+        None if merged else _patches(scene, object_id, joined["cell"].astype(np.int64)),
         _scatter(job, scene.n_objects),
     )
     return problem, _Places(joined["view"], joined["index"])

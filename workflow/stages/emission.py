@@ -48,7 +48,6 @@ from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import object_names
 from workflow.scene.see_through import seen_through, translucent_objects
 from workflow.scene.sun_search import find_sun
-from workflow.settings.light import PUBLISHED
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class FoundLight:
 
     Attributes:
         photos: with that assumption; transmittance: (n_objects,) share of the light that passes straight through each object.
-        found: the problem; solution, loss: of it.
+        found: the problem; solution: of it.
         left_out, reasons: candidate groups that turned out to reflect, and why.
         candidates: number of groups that were looked at; dropped: [(faces, area, reason)] without a solve.
         gain: (n_objects, 3) of the albedos.
@@ -69,7 +68,6 @@ class FoundLight:
     photos: Photographs
     found: Traced
     solution: EmissionSolution
-    loss: float
     left_out: EmitterGroups
     reasons: list[str]
     candidates: int
@@ -102,10 +100,6 @@ class FoundLight:
 def run(job: Job) -> None:
     """Write emitters.parquet, emitter_faces.parquet, object_gains.parquet, radiance_cache.parquet, environment_texels.parquet
     and emission.json."""
-    if job.settings.emission.solver in PUBLISHED:
-        from workflow.published import emission
-
-        return emission.run(job)
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     notes: list[str] = []
     known = view_exposures(capture, notes)
@@ -171,17 +165,17 @@ def _light(photos: Photographs, adjacency: np.ndarray) -> tuple[FoundLight, np.n
     reasons[pruned.kept[: groups.size] & ~shines] = "the photographs are explained better without it"
     reasons[shines] = ""
     candidates = groups.size + len(groups.dropped) + int(found.groups.is_hidden.sum())
-    found, solution, loss = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
+    found, solution = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
     weak = in_doubt(photos, found, solution)
     if weak.any() and (outside is not None or not weak.all()):  # without light from outside something in the room has to shine
         job.log.info("%d groups radiate no more than their error allows, and are taken out", weak.sum())
         visible = np.flatnonzero(shines)
         reasons[visible[weak[: len(visible)]]] = f"its radiance is within {SIGNIFICANT:.0f} standard errors of zero"
         found = traced(photos, unseen, found.groups.select(~weak), outside, threshold)
-        found, solution, loss = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
+        found, solution = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
     gain = reliable(found.gains) if len(found.prior.initial) else gain  # without emitters those of the trial stay
     left_out, why = groups.select(reasons != ""), [reason for reason in reasons if reason]
-    light = (found, solution, loss, left_out, why, candidates, groups.dropped, gain, outside, environment)
+    light = (found, solution, left_out, why, candidates, groups.dropped, gain, outside, environment)
     return FoundLight(photos, *light, sun, (escape, secondary), threshold, notes), glowing
 
 
@@ -218,8 +212,7 @@ def _write_facts(
             "condition": solution.condition,
             "residual": solution.residual,
             "misfit": found.misfit,
-            "solver": job.settings.emission.solver,
-            "reference_loss": light.loss,
+            "solver": "direct",
             "level_error": level_error if np.isfinite(level_error) else None,
             "level_raised": level_raised,
             "colour_moved": list(found.gains.colour_moved),
