@@ -9,7 +9,7 @@ from iif_core.errors import InputError
 from lab.published.fitting.sgd import SgdOptions
 from lab.published.fusion.direct import POLISH
 from workflow import settings
-from workflow.costs.model import cost_of
+from workflow.costs.model import predict
 from workflow.costs.work import SceneSize, work_of
 from workflow.runtime import fingerprint as fp
 
@@ -90,8 +90,8 @@ def test_settings_choose_the_modules_of_stages(sections, replaced):
 
 def test_nobody_has_measured_what_takes_the_place_of_a_stage():
     document = settings.dump(of(**PUBLISHED))
-    cost = cost_of("shading", document, SceneSize(8, 1e6, 1e4))
-    assert work_of("shading", document, SceneSize(8, 1e6, 1e4)).kind == "lab.published.stages.shading" and cost.seconds is None
+    work = work_of("shading", document, SceneSize(8, 1e6, 1e4))
+    assert work.kind == "lab.published.stages.shading" and predict("shading", work).seconds is None
     assert work_of("base", document, SceneSize(8, 1e6, 1e4)).kind == "direct"
 
 
