@@ -6,7 +6,7 @@ CORES ?= all
 COMMA := ,
 PYTHON_BIN := .venv/bin/python
 SNAKEMAKE := .venv/bin/snakemake
-# QUALITY=draft|standard|paper; SNAKEMAKE_ARGS and PYTEST_ARGS pass anything else through.
+# QUALITY=draft, p05, 120s (some 120 seconds), held_out:24 (dB); SNAKEMAKE_ARGS and PYTEST_ARGS pass anything else through.
 CONFIG = $(if $(QUALITY),--config quality=$(QUALITY))
 
 # A run starts some hundred processes; without kept byte code each of them would compile every module anew.
@@ -23,7 +23,7 @@ help:
 	@echo 'make compare/<a>,<b>  two finished results side by side'
 	@echo 'make score/<name>     scores of the maps in MAPS=<folder> against a scene with truth'
 	@echo 'make scenes           every scene of the batch table'
-	@echo '                      QUALITY=draft|standard|paper  CORES=2  SNAKEMAKE_ARGS="--dry-run"'
+	@echo '                      QUALITY=standard  CORES=2  SNAKEMAKE_ARGS="--dry-run"'
 	@echo 'make status           where every scene stands, also while a run goes on'
 	@echo 'make verify           re-hash every artefact against its manifest'
 	@echo 'make test             all tests but the long ones (PYTEST_ARGS="-k laplace" for a part)'
@@ -82,8 +82,8 @@ scenes verify: setup
 
 # Changes nothing, so it installs nothing.
 status:
-	@test -x $(SNAKEMAKE) || { echo 'status: nothing is installed yet; make scenes/<name> installs what is missing' >&2; exit 1; }
-	@$(SNAKEMAKE) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
+	@test -x $(PYTHON_BIN) || { echo 'status: nothing is installed yet; make scenes/<name> installs what is missing' >&2; exit 1; }
+	@$(PYTHON_BIN) -m workflow status $(if $(QUALITY),--quality $(QUALITY))
 
 always:
 

@@ -1,6 +1,6 @@
 # Intrinsic Image Fusion: photographs, cameras and a mesh -> scenes/<name>/ with materials, lights and camera response.
 #   snakemake --cores 2 scenes/kitchen
-#   snakemake --cores 2 scenes/kitchen --config quality=standard       or budget=120 (seconds), target=held_out:24, point=p07
+#   snakemake --cores 2 scenes/kitchen --config quality=standard       or 120s (some 120 seconds), held_out:24 (dB), p07
 #   snakemake --cores 2 scenes                                     every scene of config/batch.tsv
 # The rules are in workflow/rules/, the computations in iif_core/; docs/development/architecture.md is the map.
 from snakemake.utils import min_version
@@ -35,13 +35,6 @@ rule scenes:
         batch_targets,
 
 
-rule status:
-    """Where every scene of config/batch.tsv stands, also while a run goes on."""
-    input:
-        status_alone,
-    localrule: True
-
-
 rule verify:
     """Hash every artefact again and name what differs from its manifest."""
     log:
@@ -60,15 +53,11 @@ include: "workflow/rules/unknown.smk"
 onstart:
     choose.keep(REQUEST, CHOSEN)
     tell_costs()
-    refuse_too_large()
 
 
 onsuccess:
-    tell_target()
-    tell_pages()
-    tell_attempts()
+    tell_results()
 
 
 onerror:
-    tell_reasons(log)
-    tell_attempts()
+    tell_reasons()

@@ -117,15 +117,15 @@ def _points(options: argparse.Namespace) -> int:
 
 
 def _claims(options: argparse.Namespace) -> int:
+    from lab.studies.files import load_study
     from lab.studies.regret import TABLE, write_claims
     from workflow.decisions.expected import SHIPPED
-    from workflow.settings.study_files import load_study
 
     return guarded("claims", lambda: write_claims(load_study("regret"), TABLE, SHIPPED))
 
 
 def _costs(options: argparse.Namespace) -> int:
-    from lab.costs import refit
+    from lab.costs.refit import refit
 
     return guarded("costs", lambda: print("\n".join(refit(options.results, sizes=options.sizes))))
 

@@ -1,4 +1,6 @@
-"""What the laboratory adds to the product, by name (workflow/plugins.py): rooms with ground truth and what needs it."""
+"""What the laboratory adds to the product, by name (workflow/plugins.py)."""
+
+# ----------------------------------------------------------------------- rooms with ground truth, and what needs it
 
 KINDS = {
     "source": {
@@ -7,9 +9,9 @@ KINDS = {
     },
     "prior": {"simulated": ("lab.simulated.prior", "lab.settings.prior:SimulatedPrior")},
 }
-SECTIONS = {"scene": "lab.settings.scene:LabScene"}
 ADDED = {
     "relit_truth": {
+        "does": "Render the source of a scene with truth under new light; made on demand by studies.",
         "place": "lab.relit.truth",
         "upstream": ("capture",),
         "settings": ("source", "relit", "seed"),
@@ -17,6 +19,7 @@ ADDED = {
         "files": ("lab.relit.sources",),
     },
     "relit_scores": {
+        "does": "Render the result under new light and score it against the source; made on demand by studies.",
         "place": "lab.relit.scores",
         "upstream": ("capture", "segmentation", "base", "emission", "second_look", "affines", "relit_truth"),
         "settings": ("relit", "seed"),
@@ -30,3 +33,14 @@ COSTS = {
     "relit_scores": "lab.work:relit_scores",
 }
 SCENES = "lab/config/scenes"
+
+# ------------------------------------------------------------------------------ the published method and baselines
+
+SECTIONS = {
+    "base": "lab.settings.methods:Base",
+    "emission": "lab.settings.methods:Emission",
+    "shading": "lab.settings.methods:Shading",
+    "affines": "lab.settings.methods:Affines",
+    "scene": "lab.settings.scene:LabScene",
+}
+STAGES = {stage: f"lab.methods:{stage}" for stage in ("plan", "base", "emission", "shading", "second_look", "affines")}

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Generator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -111,3 +112,13 @@ def clean_environment(tmp_path: Path) -> dict[str, str]:
     if configuration.is_file():
         passed.setdefault("PIP_CONFIG_FILE", str(configuration))
     return {**passed, "PATH": "/usr/bin:/bin", "HOME": str(home)}
+
+
+@pytest.fixture(scope="session")
+def T(llvm):
+    """Public names of the modules of `iif_core.light.transport`, imported after Mitsuba's variant is set."""
+    from iif_core.light.transport import cache, emitters, geometry, materials, matrix, render, scene, shading
+    from tests.oracles import face_materials
+
+    modules = (cache, emitters, face_materials, geometry, materials, matrix, render, scene, shading)
+    return SimpleNamespace(**{name: value for module in modules for name, value in vars(module).items() if name[0] != "_"})

@@ -65,6 +65,7 @@ def _arguments() -> argparse.Namespace:
     batch = commands.add_parser("batch")
     batch.add_argument("--quality", default="draft")
     batch.add_argument("--fingerprint", help="of the plan whose jobs are all done; without it the summary is a partial one")
+    batch.add_argument("--over", action="store_true", help="the run is over: what has not ended by now was killed")
     batch.add_argument("--refused", action="store_true", help="only say which scenes cannot be run, and fail")
     batch.add_argument("--log", type=Path)
     status = commands.add_parser("status")
@@ -78,7 +79,7 @@ def _arguments() -> argparse.Namespace:
 
 def _verify(scenes: list[str]) -> int:
     from workflow.artifacts.verify import damaged, with_artefacts
-    from workflow.runtime.attempts import written_out
+    from workflow.runtime.job_state import written_out
     from workflow.settings.names import did_you_mean
 
     known = with_artefacts()
@@ -98,18 +99,16 @@ def _verify(scenes: list[str]) -> int:
     return 1 if problems else 0
 
 
-def _unknown_quality(quality: str) -> int:
-    """Refuse it once, before it is refused of every scene of a batch and a summary of that takes the place of a good one."""
-    from workflow.settings.loading import photographs
-
-    return guarded("quality", lambda: photographs(quality))
-
-
 def _status(scenes: list[str], quality: str, as_json: bool) -> int:
-    from workflow.status.standing import quality_of
-    from workflow.status.table import tell
+    from workflow.batch.status import tell
+    from workflow.trade import choose
 
-    return tell(scenes, partial(quality_of, quality=quality), as_json)
+    try:
+        request = choose.read({"quality": quality}, None)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return tell(scenes, lambda scene: choose.choice(request, scene).quality, as_json)
 
 
 def _run_stage(arguments: argparse.Namespace) -> int:
@@ -147,24 +146,29 @@ def _run_stage(arguments: argparse.Namespace) -> int:
 def _batch(arguments: argparse.Namespace) -> int:
     from workflow.artifacts import links
     from workflow.batch import summary
+    from workflow.settings.loading import photographs
 
     if guarded("batch", lambda: links.refuse(Path("results"), summary.FOLDER.name)):
         return 1
+    if guarded("quality", lambda: photographs(arguments.quality)):  # once, and not of every scene
+        return 1
     if arguments.refused:
         return guarded("batch", lambda: summary.refuse(arguments.quality))
-    return guarded("batch", lambda: summary.write_summary(arguments.quality, arguments.fingerprint))
+    return guarded("batch", lambda: summary.write_summary(arguments.quality, arguments.fingerprint, arguments.over))
 
 
 def _planned(scene: str, quality: str) -> None:
     """Write plan/<scene>/plan.yaml: the decisions of stage `plan`, and what is expected of them."""
     from workflow.artifacts import StageReader, links
     from workflow.artifacts.files import write_atomically
-    from workflow.decisions.expected import whole, with_expectation
+    from workflow.decisions.expected import STAGES as COSTLY
+    from workflow.decisions.expected import with_expectation
     from workflow.decisions.record import plan_text
+    from workflow.runtime import forecast
 
     links.check_folder(f"plan/{scene}")
     plan = StageReader(Path("results") / scene / "plan", "plan", scene).json("plan.json")["plan"]
-    cost = whole(scene, quality)
+    cost = forecast.together(COSTLY, scene, quality)
     text = plan_text(scene, quality, [with_expectation(item, cost) for item in plan])
     write_atomically(Path("plan") / scene / "plan.yaml", lambda path: path.write_text(text))
     print(text)
@@ -186,8 +190,6 @@ def _into(arguments: argparse.Namespace, place: Path, work: Callable[[], None]) 
 def main() -> int:
     """Run the command; the exit code is 0, or 1 with one message on stderr."""
     arguments = _arguments()
-    if arguments.command in ("batch", "status") and _unknown_quality(arguments.quality):
-        return 1
     if arguments.command == "status":
         return _status(arguments.scenes, arguments.quality, arguments.json)
     if arguments.command == "verify":

@@ -1,4 +1,4 @@
-"""The stages, in one table: what each needs and which settings it reads.
+"""The stages, in one table: what each does, needs and reads. workflow/rules/stages.smk makes a rule of every line.
 
 `settings` are dotted paths into the settings tree. A stage can see no others (`Job.settings` refuses), so its fingerprint covers
 everything that it can depend on.
@@ -13,10 +13,11 @@ from workflow import plugins
 
 @dataclass(frozen=True)
 class Stage:
-    """One rule of workflow/rules/stages.smk.
+    """One stage, which is one rule.
 
     Attributes:
         name: of the stage, its rule, its module in workflow/stages/ and its folder in results/<scene>/.
+        does: one sentence, which `snakemake --list` and a run show.
         upstream: stages whose files it reads.
         settings: dotted paths of the settings that it reads.
         reads_raw: whether files from outside results/ enter here.
@@ -24,9 +25,11 @@ class Stage:
         shared: stages whose files it reads in the folder of the scene that all variants of a study share.
         files: modules whose `raw_inputs` know (and check) further input files.
         place: name of its module where that is not `workflow.stages.<name>`.
+        threads: cores that its job takes, unless a profile says otherwise.
     """
 
     name: str
+    does: str
     upstream: tuple[str, ...]
     settings: tuple[str, ...]
     reads_raw: bool = False
@@ -34,6 +37,7 @@ class Stage:
     shared: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
     place: str = ""
+    threads: int = 2
 
     @property
     def module(self) -> str:
@@ -62,53 +66,96 @@ SHARED = "shared_"
 STAGES: dict[str, Stage] = {
     stage.name: stage
     for stage in (
-        Stage("capture", (), ("source", "capture", "seed"), reads_raw=True),
+        Stage(
+            "capture",
+            "Bring photographs, cameras and mesh into the normal form, or render them.",
+            (),
+            ("source", "capture", "seed"),
+            reads_raw=True,
+        ),
         Stage(
             "plan",
+            "Find out, from photographs and mesh alone, which parts of the model the scene requires.",
             ("capture",),
             (
-                "override.components.specular",
+                "components.specular",
                 "emission.environment",
                 "emission.saturation",
-                "emission.solver",
                 "segmentation.kind",
-                "shading.method",
                 "seed",
             ),
         ),
-        Stage("prior", ("capture",), ("prior", "source", "segmentation.kind", "seed"), reads_raw=True),
-        Stage("segmentation", ("capture", "prior"), ("segmentation", "source", "capture"), reads_raw=True),
-        Stage("base", ("capture", "prior", "segmentation"), ("base", "seed")),
-        Stage("base_scores", ("capture", "prior", "segmentation", "base"), (), reads_raw=True, on_demand=True),
+        Stage(
+            "prior",
+            "Predict materials K times for every photograph.",
+            ("capture",),
+            ("prior", "source", "segmentation.kind", "seed"),
+            reads_raw=True,
+        ),
+        Stage(
+            "segmentation",
+            "Assign faces of the mesh to objects, and pixels to segments.",
+            ("capture", "prior"),
+            ("segmentation", "source", "capture"),
+            reads_raw=True,
+        ),
+        Stage(
+            "base",
+            "Fuse the predictions of all views into one base texture.",
+            ("capture", "prior", "segmentation"),
+            ("base", "seed"),
+        ),
+        Stage(
+            "base_scores",
+            "Score the base texture; made on demand by studies.",
+            ("capture", "prior", "segmentation", "base"),
+            (),
+            reads_raw=True,
+            on_demand=True,
+        ),
         Stage(
             "emission",
+            "Find the emitters and solve for their radiance.",
             ("capture", "plan", "segmentation", "base"),
             ("emission", "capture.dynamic_range", "affines.response", "seed"),
             reads_raw=True,
             files=("workflow.scene.response_file",),
         ),
-        Stage("shading", ("capture", "plan", "segmentation", "base", "emission"), ("shading", "seed")),
+        Stage(
+            "shading",
+            "Trace the light that arrives at every pixel, once for all later fits.",
+            ("capture", "plan", "segmentation", "base", "emission"),
+            ("shading", "seed"),
+        ),
         Stage(
             "second_look",
+            "Predict and fuse once more, under the light that was found.",
             ("capture", "prior", "segmentation", "shading"),
             ("second_look", "prior", "segmentation.kind", "base", "seed"),
         ),
         Stage(
             "affines",
+            "Fit one affine map per object, and the camera response, to the photographs.",
             ("capture", "prior", "segmentation", "base", "emission", "shading", "second_look"),
             (
                 "affines",
                 "capture.dynamic_range",
                 "emission.saturation",
-                "override.components.metallic",
-                "overrides",
+                "components.metallic",
+                "materials",
                 "prior.kind",
                 "seed",
             ),
         ),
-        Stage("render", ("capture", "segmentation", "base", "emission", "shading", "second_look", "affines"), ("render", "seed")),
+        Stage(
+            "render",
+            "Render every view again with the recovered materials and lights.",
+            ("capture", "segmentation", "base", "emission", "shading", "second_look", "affines"),
+            ("render", "seed"),
+        ),
         Stage(
             "lamp_images",
+            "Render the recovered scene with every lamp by itself; made on demand by relight.",
             ("capture", "segmentation", "base", "emission", "second_look", "affines"),
             ("lamp_images", "seed"),
             reads_raw=True,
@@ -116,6 +163,7 @@ STAGES: dict[str, Stage] = {
         ),
         Stage(
             "relight",
+            "Render the recovered scene under other light, edited; made on demand.",
             ("capture", "segmentation", "base", "emission", "second_look", "affines", "lamp_images"),
             ("relight", "relight_title", "seed"),
             reads_raw=True,
@@ -123,21 +171,35 @@ STAGES: dict[str, Stage] = {
         ),
         Stage(
             "metrics",
+            "Score the result against ground truth, where there is any, and against the photographs.",
             ("capture", "prior", "segmentation", "base", "emission", "shading", "second_look", "affines", "render"),
             ("metrics",),
             reads_raw=True,
         ),
         Stage(
             "common_scores",
+            "Score the result at views that all variants of a study share; made on demand by studies.",
             ("capture", "segmentation", "base", "emission", "second_look", "affines"),
             ("seed",),
             on_demand=True,
             shared=("capture", "segmentation"),
         ),
-        Stage("unwrap", ("capture", "segmentation", "base", "emission"), ("export.max_faces_glb", "export.texture_size")),
-        Stage("export", ("capture", "segmentation", "base", "emission", "second_look", "affines", "unwrap"), ("export",)),
+        Stage(
+            "unwrap",
+            "Clean, simplify and unwrap the mesh for the exported files.",
+            ("capture", "segmentation", "base", "emission"),
+            ("export.max_faces_glb", "export.texture_size"),
+        ),
+        Stage(
+            "export",
+            "Write the result for other programs: glTF, Mitsuba, tables.",
+            ("capture", "segmentation", "base", "emission", "second_look", "affines", "unwrap"),
+            ("export",),
+            threads=1,
+        ),
         Stage(
             "room",
+            "Write room.html: a page to walk through the room and to switch its lamps.",
             ("capture", "segmentation", "base", "emission", "second_look", "affines", "unwrap"),
             ("room", "report.credit", "seed"),
             reads_raw=True,
@@ -145,15 +207,19 @@ STAGES: dict[str, Stage] = {
         ),
         Stage(
             "report",
+            "Write report.html, and plan.yaml with all decisions settled.",
             _REPORTED,
             ("report",),
             reads_raw=True,
             files=("workflow.report.sources",),
+            threads=1,
         ),
         Stage(
             "publish",
+            "Copy the deliverable to scenes/<scene>/.",
             (*_REPORTED, "report", "room"),
             (),
+            threads=1,
         ),
         *(Stage(name, **facts, on_demand=True) for name, facts in plugins.added_stages().items()),
     )

@@ -78,16 +78,6 @@ class FitProblem:
             changed[name] = tuple(part[index] for part in value) if isinstance(value, tuple) else value[index]
         return replace(self, **changed)
 
-    def merged(self) -> FitProblem:
-        """Return the problem with the mean of the halves as the only one, as the paper's loss has it."""
-        if len(self.diffuse) == 1:
-            return self
-        means = {
-            name: (0.5 * (getattr(self, name)[0] + getattr(self, name)[1]),)  # keeps the dtype of the cache
-            for name in ("diffuse", "s0", "s1")
-        }
-        return replace(self, **means)
-
 
 @dataclass(frozen=True)
 class FitOptions:
@@ -142,27 +132,6 @@ class FitOptions:
     texture_sigma: float = 2.0 / 255.0
     brightest: float = 1.25
     threads: int = 1
-
-
-@dataclass(frozen=True)
-class SgdOptions:
-    """Schedule of the paper's optimiser; the defaults are published, but for `adam`.
-
-    Attributes:
-        method: `sgd` or `adam`; rate: step size, None: 10, or 0.01 for adam.
-        epochs: passes over the pixels; batch: pixels of a step; decay: factor on the rate after each epoch.
-        seed: of the order of the pixels; free_response: fit the response too.
-        steps: steps over all epochs, with as many passes over the pixels as they need; None: one pass an epoch.
-    """
-
-    method: str = "sgd"
-    rate: float | None = None
-    epochs: int = 3
-    batch: int = 32768
-    decay: float = 0.2
-    seed: int = 0
-    free_response: bool = True
-    steps: int | None = None
 
 
 @dataclass(frozen=True)

@@ -10,20 +10,17 @@ rounding only.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from iif_core.errors import InputError
 from iif_core.fusion import kernels
 from iif_core.fusion.blocks import Block
 from iif_core.fusion.fusion_pass import FusionPass, first_pass
 from iif_core.fusion.gauge import Parts, anchor_shifts, seam_shifts
 from iif_core.fusion.options import FusionOptions
-from iif_core.fusion.outcome import build_result, measure_errors
-from iif_core.fusion.polish import fix_selection, minimise_distribution_loss
+from iif_core.fusion.outcome import build_result
 from iif_core.fusion.problem import LOWEST, FusionProblem, FusionResult, object_means
 from iif_core.fusion.selection import selection_weights
 from iif_core.fusion.sums import NO_MASK, PROPERTY_OF_ENTRY, CellSums, SegmentState, SegmentSums, sweep_summary
@@ -37,7 +34,6 @@ def solve_direct(
     options: FusionOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
     threads: int = 1,
-    chosen: NDArray | None = None,
 ) -> FusionResult:
     """Solve a problem by alternating closed forms; deterministic.
 
@@ -46,8 +42,6 @@ def solve_direct(
         options: how to solve; None = the defaults.
         progress: called as progress(done, total) after every pass over the views.
         threads: views that are worked on (and held in memory) at a time; the result does not depend on it.
-        chosen: (S, 3) int, with `objective="distribution"`: prediction of each segment and property to use in place of the
-            solver's own selection, for comparing solvers at one selection.
 
     Returns:
         The base texture with its maps, selection and uncertainty.
@@ -56,14 +50,9 @@ def solve_direct(
         InputError: shapes that do not match, ids out of range, a segment in two views.
     """
     options = options or FusionOptions()
-    if chosen is not None and options.objective != "distribution":
-        raise InputError("a given selection needs objective `distribution`; least squares selects for itself")
     means = options.variant in ("texel_mean", "object_mean")
-    # The maps of a mean are the identity, so a second sweep would change nothing. With a given selection,
-    # `minimise_distribution_loss` starts maps and texture again, so further sweeps would be lost.
-    sweeps = 1 if means or chosen is not None else options.sweeps
-    polishing = options.polish if options.objective == "distribution" and not means else 0
-    total = sweeps + polishing + 2  # 2: the first pass, and the one that measures the scales
+    sweeps = 1 if means else options.sweeps  # the maps of a mean are the identity, so a second sweep would change nothing
+    total = sweeps + 2  # 2: the first pass, and the one that measures the scales
 
     def notify(done: int) -> None:
         if progress is not None:
@@ -72,20 +61,14 @@ def solve_direct(
     # -------- maps, selection and texture in turn (Eq. F.23 to F.30) --------
     run, texture = first_pass(problem, options, threads)
     notify(1)
-    texture, history = _alternate(run, texture, sweeps, notify)
-    # -------- the paper's loss, which holds the level itself; or else the seams between parts (Eq. F.41 to F.43) --------
-    if polishing:
-        chosen = fix_selection(run.state, run.sums, chosen)
-        texture = minimise_distribution_loss(run, chosen, texture, history, notify)
-    elif options.seams and not means and problem.neighbours is not None:
+    texture, history = alternate(run, texture, sweeps, notify)
+    # -------- the seams between parts (Eq. F.41 to F.43) --------
+    if options.seams and not means and problem.neighbours is not None:
         spread = _level_spread(run.parts, run.sums)
         shift, _ = seam_shifts(run.parts, texture, run.counts.weight, problem.neighbours, spread)
         texture = _shifted(run.parts, shift, texture, run.state)
     # -------- range, errors, description --------
     texture = np.clip(texture, LOWEST, 1.0)
-    if polishing:
-        # The state still has the errors of the maps of the least squares.
-        measure_errors(run, texture)
     if options.variant == "object_mean":
         object_value, _ = object_means(texture, problem.object_of_cell, run.counts.weight)
         texture = object_value[problem.object_of_cell]
@@ -94,43 +77,7 @@ def solve_direct(
     return result
 
 
-def describe_fit(
-    problem: FusionProblem,
-    value: NDArray,
-    scale: NDArray,
-    affine: NDArray,
-    weight: NDArray,
-    history: list[dict[str, float]] | None = None,
-    threads: int = 1,
-    memory: int = 1 << 30,
-) -> FusionResult:
-    """Describe what another solver found in the way that `solve_direct` describes its own result.
-
-    Args:
-        problem: predictions on cells.
-        value, scale: (n_cells, 5) texture and its Laplace scale, which is kept as the solver found it.
-        affine: (S, K, CROSS) affine maps; weight: (S, K, 3) selection weights.
-        history: entries for the result.
-        threads: views at a time; memory: bytes of predictions that stay in memory.
-
-    Returns:
-        The result, with errors, votes, counts and fills measured on the problem.
-
-    Raises:
-        InputError: shapes that do not match, ids out of range, a segment in two views.
-    """
-    # Only the first texture depends on the variant, and nothing here reads it.
-    run, _ = first_pass(problem, FusionOptions("texel_mean", memory=memory), threads)
-    run.state.affine, run.state.alpha = affine.astype(np.float64), weight.astype(np.float64)
-    texture = np.clip(value, LOWEST, 1.0).astype(np.float32)
-    measure_errors(run, texture)
-    result = build_result(run, texture, history or [])
-    # Cells without weight have no scale of the solver; they keep the fill of `build_result`.
-    own = np.where((run.counts.weight > 0)[:, None], scale, result.scale).astype(np.float32)
-    return replace(result, scale=own)
-
-
-def _alternate(
+def alternate(
     run: FusionPass, first: NDArray, sweeps: int, notify: Callable[[int], None]
 ) -> tuple[NDArray, list[dict[str, float]]]:
     """Texture (n_cells, 5) and history after the sweeps, from the first texture on."""

@@ -27,8 +27,6 @@ class FusionOptions:
         clip_share, clip_pixels: predicted albedo of exactly 0 or 1 is left out of the fit of the albedo map where it
             makes up at most this share of the segment and at least so many pixels remain.
         scale_floor: smallest Laplace scale.
-        objective: `least_squares`, or `distribution` to minimise the paper's loss afterwards for the selection found.
-        polish: sweeps on the paper's loss.
         single_view_weight: weight in the fit of the maps of cells that one viewpoint sees (Eq. F.24); must not be 0.
         seams: close seams between the parts of an object (needs `FusionProblem.neighbours`).
         memory: bytes of predictions that stay in memory between sweeps.
@@ -49,7 +47,5 @@ class FusionOptions:
     memory: int = 1 << 30
     spill: Callable[[NDArray], NDArray] | None = None
     final_temperature: float = 0.1
-    objective: str = "least_squares"
-    polish: int = 25
     seams: bool = True
     single_view_weight: float = 0.01

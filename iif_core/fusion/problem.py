@@ -140,15 +140,6 @@ class FusionResult:
     history: list[dict[str, float]] = field(default_factory=list)
 
 
-def one_segment_per_view(problem: FusionProblem) -> FusionProblem:
-    """Return the problem with one affine map per photograph instead of one per object and photograph (an ablation)."""
-    segments = [
-        np.where(np.asarray(segment) >= 0, view, -1).astype(np.int32) for view, segment in enumerate(problem.segment_of_pixel)
-    ]
-    # A whole photograph belongs to no single object, hence -1.
-    return replace(problem, segment_of_pixel=segments, object_of_segment=np.full(len(segments), -1, np.int32))
-
-
 def check_ids(problem: FusionProblem, view: int) -> None:
     """Raise InputError if a cell or segment id of a view has no row in its table."""
     for name, ids, n in (

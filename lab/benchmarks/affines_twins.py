@@ -22,11 +22,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from iif_core.camera.response import response
 from iif_core.fitting.direct import fit_affines
-from iif_core.fitting.problem import FitOptions, FitResult, SgdOptions
-from iif_core.fitting.reference_loss import reference_loss, reference_options, reference_problem
-from iif_core.fitting.sgd import fit_affines_sgd
+from iif_core.fitting.problem import FitOptions, FitResult
 from iif_core.reflectance.material import apply_affines
 from lab.benchmarks.affines_coverage import planted
+from lab.published.fitting.reference_loss import reference_loss, reference_options, reference_problem
+from lab.published.fitting.sgd import SgdOptions, fit_affines_sgd
 
 
 def main() -> None:

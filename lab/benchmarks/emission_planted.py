@@ -82,8 +82,8 @@ def main() -> None:
     mitsuba.set_variant("llvm_ad_rgb")
     native.limit_threads(1)
     from iif_core.light.emission.direct import EmissionPrior, solve_emission, solve_families
-    from iif_core.light.emission.loss import reference_loss
-    from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
+    from lab.published.light.loss import reference_loss
+    from lab.published.light.sgd import SgdOptions, solve_emission_sgd
     from tests.unit.planted_room import PlantedScene, build_room, relative_errors
 
     scene = PlantedScene(build_room(arguments.room), arguments.views, arguments.size)

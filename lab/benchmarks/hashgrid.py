@@ -25,7 +25,7 @@ sys.path[:0] = [path for path in (str(ROOT), str(ROOT / "tests" / "benchmarks"))
 
 from hashgrid_options import OPTIONS, OURS  # noqa: E402
 
-from iif_core.fusion.hashgrid.levels import HashGridOptions, layout, widths_of  # noqa: E402
+from lab.published.fusion.hashgrid.levels import HashGridOptions, layout, widths_of  # noqa: E402
 
 SIZES = ((16, 17), (32, 19))  # levels, log2_entries
 BATCH = 65_536

@@ -1,7 +1,7 @@
 """The other ways to run a hash-grid texture that `hashgrid.py` measures: each a function that makes one iteration.
 
 `OPTIONS[name](options, batches, threads)` returns `iterate(i)`: forward, mean |sigmoid(y) - 0.5|, backward, Adam on
-batch i. All have the levels, the network and the loss of `iif_core.fusion.hashgrid`; Dr.Jit places its vertices its own way.
+batch i. All have the levels, the network and the loss of `lab.published.fusion.hashgrid`; Dr.Jit places its vertices its own way.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from iif_core.fusion.hashgrid.levels import HashGridOptions, layout
+from lab.published.fusion.hashgrid.levels import HashGridOptions, layout
 from tests.oracles.torch_hashgrid import TorchTexture
 
 RATE = 1e-2

@@ -41,8 +41,8 @@ def measured(pixels: int) -> str:
     """Return a row of the table for a problem of so many pixels."""
     from iif_core.camera.response import response
     from iif_core.fitting.problem import FitProblem
-    from iif_core.fitting.published import PublishedOptions, PublishedState, descend
-    from iif_core.fitting.reference_loss import reference_loss
+    from lab.published.fitting.descent import PublishedOptions, PublishedState, descend
+    from lab.published.fitting.reference_loss import reference_loss
     from workflow.artifacts.scratch import Joined
 
     rng, here = np.random.default_rng(0), Path(".")

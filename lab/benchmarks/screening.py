@@ -47,8 +47,6 @@ from workflow.scoring.scores import MaterialTruth, material_truth
 REPOSITORY = Path(__file__).resolve().parents[2]
 CODE = ("iif_core", "workflow", "config")
 STAGES = ("base", "emission", "shading", "affines")
-OTHER_SOLVERS = ("baselines", "hashgrid", "sgd", "adam", "reference_loss")
-"""Packages and modules that the default solvers do not use."""
 FACTORS = (0.5, 2.0)
 SAME_LIGHT = 0.005
 """Emitters, gains of objects and the error of the level that differ by less than this share are the same light: a change of all
@@ -134,8 +132,7 @@ def chosen(names: list[str]) -> list[Constant]:
         path = REPOSITORY / Path(*module.split("."))
         files = sorted(path.rglob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
         modules = [".".join(file.relative_to(REPOSITORY).with_suffix("").parts) for file in files if file.name != "__init__.py"]
-        used = [m for m in modules if not set(m.split(".")) & set(OTHER_SOLVERS)]
-        every = [constant for m in used for constant in constants_of(m)]
+        every = [constant for m in modules for constant in constants_of(m)]
         here = [constant for constant in every if not only or constant.name == only]
         if not here:
             raise SystemExit(f"{name}: no such constant; {module} has {', '.join(c.name for c in every) or 'none'}")

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from iif_core.errors import InputError
-from lab.points.picture import PICTURE, draw
+from lab.points.picture import PICTURE, Pooled, draw
+from lab.studies.files import load_study
 from workflow.artifacts.files import write_atomically
 from workflow.settings.names import REPOSITORY
 from workflow.settings.scene import SceneSettings
-from workflow.settings.study_files import load_study
-from workflow.trade.points import SCORES, SHIPPED, Point, Pooled, named
+from workflow.trade.points import SCORES, SHIPPED, Point, named
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-from workflow.trade.points import Pooled
+from typing import Any, NamedTuple
 
 PICTURE = Path("docs/pictures/tradeoff.png")
 _FRONT, _OTHER, _RUN = "#0072b2", "#d55e00", "#b0b0b0"  # colour-blind safe (Okabe, Ito)
+
+
+class Pooled(NamedTuple):
+    """A variant over all rooms: geometric mean of its CPU seconds, mean of its albedo score in dB, and both in each room."""
+
+    variant: str
+    cpu_seconds: float
+    albedo: float
+    rooms: Mapping[str, Mapping[str, float]]
 
 
 def draw(pooled: Sequence[Pooled], chosen: Sequence[Pooled], names: Sequence[str], others: Sequence[Pooled], path: Path) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from lab.settings.methods import PUBLISHED
 from workflow.settings.scene import SceneSettings
 from workflow.settings.section import Section
 
@@ -30,6 +31,34 @@ class Relit(Section):
 
 
 class LabScene(SceneSettings):
-    """The settings of the product, and those of scored relighting."""
+    """The settings of the product, those of scored relighting, and what must hold where another method than ours is chosen."""
 
     relit: Relit = Relit()
+
+    @model_validator(mode="after")
+    def _published_photographs(self) -> LabScene:
+        solver = self.emission.solver
+        if solver in PUBLISHED and not isinstance(self.affines.response, str):
+            raise ValueError(
+                f"`emission: solver: {solver}` takes a family as `affines: response`, and no measured curve; name one, or set"
+                " another solver"
+            )
+        if solver in PUBLISHED and self.capture.dynamic_range == "hdr":
+            raise ValueError(
+                f"`emission: solver: {solver}` knows the loss of 8-bit photographs alone; set `capture: {{dynamic_range: ldr}}`,"
+                " or another solver"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _forced_components(self) -> LabScene:
+        forced = {name: value for name, value in self.components.model_dump().items() if value != "auto"}
+        if forced and (self.emission.solver in PUBLISHED or self.shading.method == "published"):
+            raise ValueError(f"`components: {', '.join(forced)}`: the published method has no plan; remove it")
+        ours = self.affines.model == "objects" and self.affines.solver == "direct"
+        for component in ("specular", "metallic"):
+            if forced.get(component) == "off" and not ours:
+                raise ValueError(f"`components: {component}: off`: needs `affines: {{model: objects, solver: direct}}`")
+        if self.materials and not ours:
+            raise ValueError("`materials`: materials given by hand need `affines: {model: objects, solver: direct}`; remove them")
+        return self

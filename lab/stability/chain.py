@@ -283,7 +283,7 @@ ROOMS: dict[str, dict[str, Any]] = {
         "emission": {"rows": 4000, "samples": 16},
         "shading": {"samples": 16, "levels": 6},
         "affines": {"pixels": 20000},
-        "override": {"components": {"specular": "on"}},
+        "components": {"specular": "on"},
     },
     "kitchen": {
         "source": {"kind": "builtin", "scene": "kitchen"},
@@ -293,7 +293,7 @@ ROOMS: dict[str, dict[str, Any]] = {
         "emission": {"rows": 10000, "samples": 16},
         "shading": {"samples": 16, "levels": 8},
         "affines": {"pixels": 50000},
-        "override": {"components": {"specular": "on", "environment": "off"}},
+        "components": {"specular": "on", "environment": "off"},
     },
 }
 """Captures that are made once and changed: linear photographs of a closed room, and 8-bit ones of unknown response. What the plan

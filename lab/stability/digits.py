@@ -112,7 +112,7 @@ def measure(room: str, runs: int = RUNS) -> Iterator[Digits | Flips]:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         capture = chain.make_capture(folder / "capture", chain.ROOMS[room])
-        free = {**capture.document, "override": chain.document_of({**chain.ROOMS[room], "override": {}})["override"]}
+        free = {**capture.document, "components": chain.document_of({**chain.ROOMS[room], "components": {}})["components"]}
         capture = replace(capture, document=free)  # what the plan decides belongs to the result here
         reference = chain.run(capture, folder / "reference")
         for moved, movement in MOVEMENTS.items():

@@ -515,7 +515,7 @@ def _exact_level(*u: Any) -> tuple[Any, ...]:
 
 
 def _compiled_level(arrays: list[np.ndarray]) -> tuple[np.ndarray, ...]:
-    from iif_core.fusion.hashgrid import kernels as hashgrid
+    from lab.published.fusion.hashgrid import kernels as hashgrid
 
     count = len(arrays[0])
     encoded = np.zeros((-(-count // hashgrid.BLOCK), 2, hashgrid.BLOCK), np.float32)

@@ -246,7 +246,7 @@ ROOMS: dict[str, dict[str, Any]] = {
         "emission": {"rows": 10000, "samples": 16},
         "shading": {"samples": 16, "levels": 8},
         "affines": {"pixels": 50000},
-        "override": {"components": {"specular": "on", "environment": "off"}},
+        "components": {"specular": "on", "environment": "off"},
     },
 }
 """Rooms of the study: those of `chain`, and a scene with ground truth by somebody else, which has to be at its path."""

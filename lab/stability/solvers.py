@@ -187,7 +187,7 @@ def _affine_map(kind: str, values: NDArray, weight: float) -> Solved:
 
 def gains_of_one_channel() -> Iterator[Solved]:
     """Gain and offset under the paper's regulariser (Eq. F.34)."""
-    from iif_core.fusion.matching import penalised_gain
+    from lab.published.fusion.matching import penalised_gain
 
     for kind, strength in itertools.product(KINDS, (1e-12, 100.0)):
         matrix = gram(kind, 2, np.random.default_rng(2)) if kind != "zero columns" else np.diag([0.0, 1.0])

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 from iif_core.errors import InputError
 from lab.studies import table
+from lab.studies.files import Study
 from workflow.artifacts.files import sha256_of, write_atomically
 from workflow.runtime import fingerprint as fp
-from workflow.settings.study_files import Study
 
 if TYPE_CHECKING:
     import numpy as np

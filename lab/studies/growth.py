@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from workflow.settings.study_files import Study
+from lab.studies.files import Study
 
 if TYPE_CHECKING:
     import pandas as pd

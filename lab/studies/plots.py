@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iif_core.evaluation.catalogue import METRICS, PROTOCOLS
-from workflow.settings.study_files import Study
+from lab.studies.files import Study
 
 if TYPE_CHECKING:
     import pandas as pd

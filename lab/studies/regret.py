@@ -14,8 +14,8 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.evaluation.catalogue import METRICS
+from lab.studies.files import Opposite, Study
 from workflow.artifacts.files import write_atomically
-from workflow.settings.study_files import Opposite, Study
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 from iif_core.errors import InputError
 from iif_core.evaluation.catalogue import METRICS, RELIT, RELIT_PROTOCOLS
 from lab.studies import table
+from lab.studies.files import load_study
 from lab.studies.grid import LIGHTS, sheet, write_grid
 from workflow.artifacts.files import write_atomically
 from workflow.report.blocks import fill, markdown
 from workflow.runtime import fingerprint as fp
 from workflow.settings.names import REPOSITORY
-from workflow.settings.study_files import load_study
 
 if TYPE_CHECKING:
     import pandas as pd

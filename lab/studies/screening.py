@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from iif_core.errors import InputError
-from workflow.settings.study_files import MORRIS_LEVELS as LEVELS
-from workflow.settings.study_files import load_study
+from lab.studies.files import MORRIS_LEVELS as LEVELS
+from lab.studies.files import load_study
 
 CANDIDATES = 20
 """Random trajectories of which the most different ones are taken (Campolongo, Cariboni and Saltelli 2007)."""

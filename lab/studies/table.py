@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from iif_core.errors import InputError
 from iif_core.evaluation.catalogue import METRICS, PROTOCOLS, PROTOCOLS_OF, RELIT
+from lab.costs.records import disk_mb
+from lab.studies.files import Paper, Study, load_study
 from lab.studies.growth import growth_lines
 from lab.studies.regret import judge, regret_lines
 from workflow.artifacts.files import write_atomically
-from workflow.costs.records import disk_mb
 from workflow.registry import upstream_of
 from workflow.runtime import fingerprint as fp
 from workflow.runtime.timings import read_parts, read_timings
@@ -43,7 +44,7 @@ class Cell(NamedTuple):
 class Plan(NamedTuple):
     """What a study runs, and the scenes that it leaves out with the reason."""
 
-    study: study_files.Study
+    study: Study
     cells: tuple[Cell, ...]
     skipped: dict[str, str]
 
@@ -55,7 +56,7 @@ def plan(name: str, quality: str) -> Plan:
     Raises:
         InputError: a mistake in the study's file or in settings that it leads to.
     """
-    study = study_files.load_study(name)
+    study = load_study(name)
     cells, skipped = [], {}
     for scene in study.scenes:
         of_scene = [
@@ -137,7 +138,7 @@ def table(name: str, quality: str) -> pd.DataFrame:
     return frame
 
 
-def _rows(name: str, study: study_files.Study, cell: Cell, quality: str) -> list[dict[str, Any]]:
+def _rows(name: str, study: Study, cell: Cell, quality: str) -> list[dict[str, Any]]:
     """One row for each score of a cell."""
     variant = study.variants[cell.variant]
     facts = {
@@ -145,7 +146,7 @@ def _rows(name: str, study: study_files.Study, cell: Cell, quality: str) -> list
         "scene": cell.scene,
         "variant": cell.variant,
         "label": variant.label or cell.variant,
-        "settings": json.dumps(variant.layer, sort_keys=True),
+        "settings": json.dumps({**variant.overrides, **({"preset": variant.preset} if variant.preset else {})}, sort_keys=True),
         "seed": cell.seed,
         **(_costs(cell, quality, study.costs) if not variant.row else {}),
         "status": "ok",
@@ -219,7 +220,7 @@ def _write_table(frame: pd.DataFrame, path: Path) -> None:
     pq.write_table(table, path, compression="zstd")
 
 
-def _protocol_of(paper: study_files.Paper, quantity: str) -> str:
+def _protocol_of(paper: Paper, quantity: str) -> str:
     """The protocol of a publication's numbers; `raw` for quantities to which its own does not apply."""
     return paper.protocol if quantity in RELIT or paper.protocol in PROTOCOLS_OF.get(quantity, ()) else "raw"
 
@@ -298,7 +299,7 @@ def pareto_front(costs: list[float], values: list[float], higher_is_better: bool
     return [not any(q != p and q[0] <= p[0] and q[1] <= p[1] for q in points) for p in points]
 
 
-def page(study: study_files.Study, frame: pd.DataFrame, skipped: dict[str, str]) -> str:
+def page(study: Study, frame: pd.DataFrame, skipped: dict[str, str]) -> str:
     """Format the table as Markdown: a block per metric, then the costs."""
     lines = [f"# {study.title}", ""]
     for scene, reason in skipped.items():
@@ -370,7 +371,7 @@ def page(study: study_files.Study, frame: pd.DataFrame, skipped: dict[str, str])
 
 
 def _by_scene(
-    study: study_files.Study, chosen: pd.DataFrame, quantity: str, metric: str, scenes: list[str], labels: dict[str, str]
+    study: Study, chosen: pd.DataFrame, quantity: str, metric: str, scenes: list[str], labels: dict[str, str]
 ) -> list[str]:
     """Format one metric with a row for each scene and a column for each variant, protocol by protocol."""
     lines = []
@@ -398,7 +399,7 @@ def _costs_table(shown: pd.DataFrame, scenes: list[str], labels: dict[str, str])
     return _markdown(["scene", "variant", "s", "CPU s", "solver s", "solver CPU s", "peak MB", "disk MB"], body, words=2)
 
 
-def _effects(study: study_files.Study, shown: pd.DataFrame, scenes: list[str]) -> list[str]:
+def _effects(study: Study, shown: pd.DataFrame, scenes: list[str]) -> list[str]:
     """Rank the factors of a screening by their effect on each score and on the costs (lab/docs/studies.md#designs)."""
     from lab.studies.screening import elementary_effects, ranked
 

@@ -332,7 +332,7 @@ SCENE = {
     "capture": {"width": 64, "height": 48, "views": 4, "exposure": "given"},
     "prior": {"kind": "retinex", "samples": 2},
     "segmentation": {"kind": "geometry"},
-    "affines": {"solver": "direct", "response": "srgb"},
+    "affines": {"iterations": 60, "response": "srgb"},
     "relight": [{"name": "evening", "emitters": 0.5, "sphere": {"center": [1, 1, 1], "radius": 0.1}, "exposure": 2}],
 }
 TABLE = (

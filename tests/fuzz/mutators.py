@@ -52,7 +52,7 @@ KEYS = (
     *("_name", "_mask", "_seen", "_split", "_mask_full", "_where", "_at", "__class__", "w", "h", "fl_x", "k1", "k4", "p1", "cx"),
     *("file_path", "mask_path", "depth_file_path", "depth_intrinsics", "camera_model", "is_fisheye", "camera_angle_x", "frames"),
     *("depth_unit_m", "pixel_centres_at", "train_filenames", "test_filenames", "test_frames", "kind", "path", "preset", "limits"),
-    *("overrides", "override", "relight", "", "<<", "a" * 3000),
+    *("materials", "components", "relight", "", "<<", "a" * 3000),
 )
 YAML_LINES = (
     "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\nb: &b [*a, *a, *a, *a, *a, *a, *a, *a]\nc: &c [*b, *b, *b, *b, *b, *b, *b, *b]\n"

@@ -5,8 +5,8 @@ import json
 import pandas as pd
 import pytest
 
+from lab.studies.files import Study
 from lab.studies.growth import exponent, growth_lines
-from workflow.settings.study_files import Study
 
 
 @pytest.mark.parametrize("power", [0.0, 0.5, 1.0, 2.0])

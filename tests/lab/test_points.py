@@ -6,12 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lab.points import front
-from workflow.settings import loading, study_files
+from lab.points.picture import Pooled
+from lab.studies.files import load_study
+from workflow.settings import loading
 from workflow.settings.names import REPOSITORY
 from workflow.settings.scene import SceneSettings
 from workflow.settings.yaml_file import read_yaml
 from workflow.trade import points as trade_points
-from workflow.trade.points import Pooled
 
 
 def rows(costs, scores, rooms=("a", "b")):
@@ -50,7 +51,7 @@ def test_points_of_the_front_are_apart_and_each_is_better_than_all_cheaper_ones(
 
 def test_the_points_that_are_checked_in_other_rooms_are_those_of_the_front(monkeypatch):
     monkeypatch.chdir(REPOSITORY)
-    design = study_files.load_study("tradeoff_check").design
+    design = load_study("tradeoff_check").design
     scene = {"source": {"kind": "builtin", "scene": "tiny"}, "prior": {"kind": "simulated"}}
 
     def settings(layer):

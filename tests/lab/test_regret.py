@@ -5,9 +5,9 @@ import pandas as pd
 import pytest
 
 from lab.studies import regret
+from lab.studies.files import Opposite, load_study
 from lab.studies.table import KEPT
 from tests.errors import refused
-from workflow.settings.study_files import Opposite, load_study
 
 SCORES = [("albedo", "psnr", "scaled"), ("roughness", "l2", "raw"), ("rgb", "psnr", "raw")]
 OPPOSITES = {
@@ -86,7 +86,7 @@ def test_the_study_names_the_components_that_can_be_forced(repository, monkeypat
     study = load_study("regret")
     assert set(study.opposites) == set(OVERRIDDEN) and study.reference == "plan"
     for component, opposite in study.opposites.items():
-        forced = study.variants[opposite.forced_out].overrides["override"]["components"]
+        forced = study.variants[opposite.forced_out].overrides["components"]
         assert list(forced) == [component]
 
 

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from lab.studies.files import MORRIS_LEVELS as LEVELS
+from lab.studies.files import load_study
 from lab.studies.screening import elementary_effects, ranked, trajectories
 from tests.errors import refused
-from workflow.settings import study_files
-from workflow.settings.study_files import MORRIS_LEVELS as LEVELS
 
 FACTORS = ["a", "b", "c", "d"]
 
@@ -43,7 +43,7 @@ def study(tmp_path, monkeypatch, runs, count=2):
     design = f"{{trajectories: {count}, factors: {levels}, runs: {json.dumps(runs)}}}"
     (tmp_path / "config/studies/s.yaml").write_text(f"title: T\nscenes: [a]\ndesign: {design}\n")
     monkeypatch.chdir(tmp_path)
-    return study_files.load_study("s")
+    return load_study("s")
 
 
 def test_runs_become_variants_and_a_run_that_is_there_twice_is_one(tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 """Studies: names of derived scenes, what they override, what they share, errors, and the arithmetic of the table."""
 
+import itertools
 import json
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 from scipy import stats
 
 from iif_core.fusion.uncertainty import CALIBRATION
+from lab.studies import files
 from lab.studies import table as study_table
 from tests.errors import refused
 from workflow import settings
@@ -39,14 +41,14 @@ def folder(tmp_path, monkeypatch):
         path = tmp_path / "config" / f"{name}.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-        for cached in (fp.resolved, fp.fingerprint, fp.home, study_table.plan, study_files._load_study):
+        for cached in (fp.resolved, fp.fingerprint, fp.home, study_table.plan, study_files._load_study, files._load_study):
             cached.cache_clear()
 
     write("scenes/t", SCENE)
     write("studies/scenes", SHARED)
     write("studies/a", STUDY)
     yield write
-    for cached in (fp.resolved, fp.fingerprint, fp.home, study_table.plan, study_files._load_study):
+    for cached in (fp.resolved, fp.fingerprint, fp.home, study_table.plan, study_files._load_study, files._load_study):
         cached.cache_clear()
 
 
@@ -166,25 +168,17 @@ def test_a_variant_chooses_a_preset_over_what_the_study_shares(folder):
     text = "title: x\nscenes: [t]\ncommon: {shading: {pixels: 500000}}\nvariants:\n  ours: {}\n"
     folder("studies/a", text + "  theirs: {preset: published, overrides: {emission: {iterations: 7}}}\n")
     ours, theirs = (settings.load(f"t--a-{name}-s0") for name in ("ours", "theirs"))
-    assert (ours.preset, ours.shading.pixels, ours.emission.solver) == ("ours", 500000, "direct")
-    assert (theirs.preset, theirs.shading.pixels, theirs.emission.solver) == ("published", "all", "published")
+    assert (ours.shading.pixels, ours.emission.solver) == (500000, "direct")
+    assert (theirs.shading.pixels, theirs.emission.solver) == ("all", "published")
     assert theirs.emission.iterations == 7 and theirs.prior == ours.prior
     for stage in ("capture", "prior", "segmentation"):
         assert fp.home(stage, "t--a-theirs-s0", "draft") == fp.home(stage, "t--a-ours-s0", "draft")
-    folder("scenes/t", SCENE + "preset: published\n")  # a variant can also choose ours
-    plain = text.replace("common: {shading: {pixels: 500000}}\n", "").replace("ours: {}", "ours: {preset: ours}")
-    folder("studies/a", plain + "  theirs: {}\n")
-    assert [settings.load(f"t--a-{name}-s0").emission.solver for name in ("ours", "theirs")] == ["direct", "published"]
     folder("scenes/t", SCENE + "base: {solver: sgd, texture: cells, iterations: 5}\naffines: {solver: sgd, epochs: 1}\n")
     folder("studies/a", text + "  theirs: {preset: published}\n")
     theirs = settings.load("t--a-theirs-s0")  # what the scene sets for another method is not part of the published one
     assert (theirs.base.texture, theirs.base.iterations, theirs.affines.epochs) == (None, None, 3)
     folder("scenes/t", SCENE.replace("capture: {", "capture: {dynamic_range: hdr, "))
     with refused("a.yaml, variant theirs", "emission: solver: published", "capture: {dynamic_range: ldr}"):
-        settings.load("t--a-theirs-s0")
-    folder("scenes/t", SCENE)
-    folder("studies/a", text + "  theirs: {preset: published, overrides: {emission: {prune: 0.1}}}\n")
-    with refused("a.yaml, variant theirs", "emission", "prune", "solver: direct", "sgd", "solver: published"):
         settings.load("t--a-theirs-s0")
 
 
@@ -292,15 +286,15 @@ def test_finished_scores_are_kept_before_the_study_ends(folder, tmp_path):
 
 
 def test_page_of_the_result_has_means_over_scenes_and_the_protocol_of_each_number():
-    study = study_files.Study(
+    study = files.Study(
         title="T",
         scenes=["t", "u"],
         seeds=[0],
         scores="metrics",
         costs=["affines"],
         protocols=["raw", "scaled"],
-        variants={"a": study_files.Variant(label="first")},
-        paper={"a": study_files.Paper(protocol="scaled", values={"albedo/psnr": 20.0, "roughness/l2": 0.5})},
+        variants={"a": files.Variant(label="first")},
+        paper={"a": files.Paper(protocol="scaled", values={"albedo/psnr": 20.0, "roughness/l2": 0.5})},
         show=["albedo/psnr", "roughness/l2"],
     )
     row = {"variant": "a", "seed": 0, "cpu_seconds": 1.0, "status": "ok"}
@@ -328,11 +322,11 @@ def test_page_of_the_result_has_means_over_scenes_and_the_protocol_of_each_numbe
 
 
 def test_page_says_by_how_much_the_reference_moves():
-    study = study_files.Study(
+    study = files.Study(
         title="T",
         scenes=["t"],
         reference="a",
-        variants={"a": study_files.Variant(), "b": study_files.Variant()},
+        variants={"a": files.Variant(), "b": files.Variant()},
         show=["albedo/psnr"],
     )
     rows = [("a", 0, "psnr", 20.0, 1.0), ("a", 1, "psnr", 24.0, 1.0), ("b", 0, "psnr", 21.0, 1.0), ("b", 1, "psnr", 27.0, 1.0)]
@@ -342,7 +336,7 @@ def test_page_says_by_how_much_the_reference_moves():
 
 
 def test_scenes_can_be_the_rows_of_the_page():
-    study = study_files.Study(
+    study = files.Study(
         title="Rooms",
         scenes=["a", "b"],
         seeds=[0],
@@ -371,7 +365,7 @@ def test_a_shared_result_is_read_from_where_it_lies(folder, tmp_path):
 
 def test_grids_are_variants(folder):
     folder("studies/a", "title: x\nscenes: [t]\ngrids: [{base.ridge: [0.1, 1.0e-3], base.variant: [full, uniform]}]\n")
-    variants = study_files.load_study("a").variants
+    variants = files.load_study("a").variants
     assert list(variants) == ["0_1-full", "0_1-uniform", "0_001-full", "0_001-uniform"]
     assert variants["0_001-uniform"].overrides == {"base": {"ridge": 0.001, "variant": "uniform"}}
     assert settings.load("t--a-0_001-uniform-s2").base.ridge == 0.001
@@ -380,8 +374,8 @@ def test_grids_are_variants(folder):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (STUDY + "colour: 1\n", ["config/studies/a.yaml", "colour", "title, scenes"]),
-        (STUDY.replace("label:", "lable:"), ["variants.mean-2.lable", "label, row, overrides, preset"]),
+        (STUDY + "colour: 1\n", ["config/studies/a.yaml", "colour", "title", "scenes"]),
+        (STUDY.replace("label:", "lable:"), ["variants.mean-2.lable", "label", "overrides", "preset", "row"]),
         (STUDY + "plot: {kind: pie}\n", ["plot.kind", "'pie'", "'bars'"]),
         (STUDY + "plot: {kidn: bars}\n", ["plot.kidn", "kind, x, group, history, log"]),
         (STUDY + "plot: {kind: line, x: base.sweeps}\n", ["plot", "'base.sweeps'", "base.variant"]),
@@ -404,7 +398,7 @@ def test_grids_are_variants(folder):
 def test_mistakes_in_a_study(folder, text, words):
     folder("studies/a", text)
     with refused("config/studies/a.yaml", *words):
-        study_files.load_study("a")
+        files.load_study("a")
 
 
 def test_settings_are_blamed_on_the_file_that_spoils_them(folder):
@@ -438,16 +432,15 @@ def test_unlisted_scenes(folder):
         settings.load("u--a-full-s0")
     folder("studies/scenes", SHARED + "kitchn: {}\n")
     with refused("config/studies/scenes.yaml", "kitchn", "source"):
-        study_files.load_study("a")
+        files.load_study("a")
 
 
-def test_shipped_studies_are_sound(repository, monkeypatch):
+def test_shipped_studies_load_at_every_quality(repository, monkeypatch):
     monkeypatch.chdir(repository)
     for name in study_files.study_names():
-        study = study_files.load_study(name)
-        for scene in study.scenes:
-            for variant in study.variants:
-                settings.load(study_files.scene_of(name, scene, variant, study.seeds[0]))
+        study = files.load_study(name)
+        for quality, scene, variant in itertools.product(settings.QUALITIES, study.scenes, study.variants):
+            settings.load(study_files.scene_of(name, scene, variant, study.seeds[0]), quality)
 
 
 def test_parts_of_a_job_are_timed(folder):
@@ -491,12 +484,12 @@ def test_front_is_of_means_over_seeds_and_knows_which_way_is_better():
 
 
 def test_page_shows_both_and_the_paper():
-    study = study_files.Study(
+    study = files.Study(
         title="T",
         scenes=["t"],
         seeds=[0, 1],
-        variants={"a": study_files.Variant(label="first"), "b": study_files.Variant()},
-        paper={"b": study_files.Paper(protocol="oracle_affine", values={"albedo/psnr": 30.794})},
+        variants={"a": files.Variant(label="first"), "b": files.Variant()},
+        paper={"b": files.Paper(protocol="oracle_affine", values={"albedo/psnr": 30.794})},
         show=["albedo/psnr", "albedo/lpips_vgg"],
     )
     frame = frame_of([("a", 0, "psnr", 20.0, 1.0), ("a", 1, "psnr", 22.0, 3.0), ("b", 0, "psnr", 24.0, 2.0)])
@@ -520,14 +513,14 @@ def test_table_on_disk_keeps_what_is_unknown_unknown(tmp_path):
 def test_every_kind_of_picture_is_drawn(tmp_path):
     from lab.studies.plots import draw
 
-    variants = {str(k): study_files.Variant(overrides={"base": {"sweeps": k, "variant": "full"}}) for k in (1, 2, 4)}
-    paper = {"2": study_files.Paper(protocol="raw", values={"albedo/psnr": 21.0})}
+    variants = {str(k): files.Variant(overrides={"base": {"sweeps": k, "variant": "full"}}) for k in (1, 2, 4)}
+    paper = {"2": files.Paper(protocol="raw", values={"albedo/psnr": 21.0})}
     frame = frame_of([(name, s, "psnr", 20.0 + s + int(name), 1.0 * int(name)) for name in variants for s in (0, 1)])
     frame["pareto"] = study_table._pareto(frame)
     histories = {study_table.Cell("t", name, 0, ""): [{"entropy": 2.0}, {"entropy": 1.0}] for name in variants}
     for kind in ("bars", "line", "pareto", "history"):
-        plot = study_files.Plot(kind=kind, x="base.sweeps", group=["base.variant"], log=True)
-        study = study_files.Study(title="T", scenes=["t"], variants=variants, paper=paper, show=["albedo/psnr"], plot=plot)
+        plot = files.Plot(kind=kind, x="base.sweeps", group=["base.variant"], log=True)
+        study = files.Study(title="T", scenes=["t"], variants=variants, paper=paper, show=["albedo/psnr"], plot=plot)
         draw(study, frame, histories, tmp_path / f"{kind}.png")
         assert (tmp_path / f"{kind}.png").stat().st_size > 5000
         draw(study, frame[:0], {}, tmp_path / "empty.png")
@@ -538,11 +531,11 @@ def test_a_few_named_variants_have_a_colour_each_and_what_is_not_scored_no_panel
 
     from lab.studies.plots import draw
 
-    variants = {name: study_files.Variant(label="same") for name in "abc"}
+    variants = {name: files.Variant(label="same") for name in "abc"}
     frame = frame_of([(name, 0, "psnr", 20.0 + i, 1.0 + i) for i, name in enumerate(variants)])
     frame["pareto"] = study_table._pareto(frame)
     kinds = {"scenes": ["t"], "protocols": ["raw", "scaled"], "show": ["albedo/psnr"]}
-    study = study_files.Study(title="T", variants=variants, plot=study_files.Plot(kind="pareto"), **kinds)
+    study = files.Study(title="T", variants=variants, plot=files.Plot(kind="pareto"), **kinds)
     figures = []
     monkeypatch.setattr(plt, "close", figures.append)
     draw(study, frame, {}, tmp_path / "t.png")

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from iif_core.fusion.hashgrid.texture import HashGridTexture
+from lab.published.fusion.hashgrid.texture import HashGridTexture
 
 
 class TorchTexture(HashGridTexture):

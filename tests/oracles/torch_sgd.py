@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from iif_core.fusion.kernels import IDENTITY
 from iif_core.fusion.problem import LOWEST
-from iif_core.fusion.sgd.kernels import LOCATION, SCALE
-from iif_core.fusion.sgd.options import SgdOptions
-from iif_core.fusion.sgd.pool import TERMS, Pool, Step, softmax, start_values
+from lab.published.fusion.sgd.kernels import LOCATION, SCALE
+from lab.published.fusion.sgd.options import SgdOptions
+from lab.published.fusion.sgd.pool import TERMS, Pool, Step, softmax, start_values
 
 _PROPERTY_OF_CHANNEL = [0, 0, 0, 1, 2]
 

@@ -7,7 +7,6 @@ and keeps the row for lab/notebook/reliability.md. It needs a machine that does 
 import csv
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -29,17 +28,6 @@ ACCOUNTING = bool(os.environ.get("IIF_SLURM_ACCOUNTING"))
 SCENES = "abc"
 PROFILES = REPOSITORY / "workflow/profiles"
 ROW = REPOSITORY / "lab/notebook/data/reliability_slurm.json"
-HOG = """
-import sys, time
-from workflow.runtime.job_state import JobState
-from workflow.runtime.job import configure_logging
-configure_logging(None)
-JobState("a", sys.argv[1], "mark").started()
-memory = [bytearray(b"x" * (8 << 20)) for _ in range(int(sys.argv[2]))]
-time.sleep(float(sys.argv[3]))
-JobState("a", sys.argv[1], "mark").done()
-"""
-"""A job that takes memory (8 MB each) and time, and tells of itself as a stage does."""
 
 
 def command(folder, *arguments):
@@ -82,35 +70,6 @@ def local(batch):
     done = subprocess.run(command(folder, "--cores", 2, "scenes"), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
     return folder
-
-
-def submit(folder, name, blocks, seconds, *options):
-    """Submit a job that takes the given memory and time; return its id."""
-    log = folder / f"{name}-%j.out"
-    program = f"{REPOSITORY}/.venv/bin/python"
-    (folder / "hog.py").write_text(HOG)
-    return subprocess.run(
-        [
-            "sbatch",
-            "--parsable",
-            f"--chdir={folder}",
-            f"--output={log}",
-            *options,
-            "--wrap",
-            f"{program} hog.py {name} {blocks} {seconds}",
-        ],
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.strip()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def overdue(tmp_path_factory):
-    """A job that goes over its time limit, while the other tests run: Slurm counts in minutes."""
-    folder = tmp_path_factory.mktemp("overdue")
-    return folder, submit(folder, "late", 1, 600, "--time=1", "--mem=300")
 
 
 def jobs():
@@ -164,10 +123,7 @@ def test_a_batch_survives_a_cancelled_job_and_a_killed_controller(batch, local):
     assert process.returncode == 0, output[-4000:]
     assert manifests(folder) == manifests(local)
     assert not jobs()
-    told = re.search(
-        rf"^\w: \w+: attempt 2, which asks for .*: attempt 1 \(Slurm job {first} on \S+\) was cancelled", output, re.M
-    )
-    assert told, output[-4000:]
+    assert f"Slurm job {first} ended with CANCELLED" in output, output[-4000:]
     key = f"batch, {'with' if ACCOUNTING else 'without'} accounting"
     keep(**{key: {"scenes": len(SCENES), "cancelled": 1, "controller killed": 1, "equal to local": "yes"}})
 
@@ -251,51 +207,3 @@ def test_one_job_for_each_stage(batch, local):
         rows = list(csv.DictReader(report.read_text().splitlines()))
         assert {row["RuleName"].split("_wildcards")[0] for row in rows} == {"rule_capture", "rule_prior_part", "rule_prior"}
         assert any(float(row["CPU Efficiency (%)"]) > 0 and float(row["Memory Usage (%)"]) > 0 for row in rows), rows
-
-
-@pytest.mark.parametrize("profile", ["slurm-scenes", "slurm"])
-def test_why_slurm_refuses_a_job_is_the_last_line(batch, profile):
-    """It never begins, so it leaves no state and no log."""
-    folder = batch(f"refused-{profile}")
-    small = ["--set-threads", "capture=2", "emission=2", "shading=2", "render=2"] if profile == "slurm" else []
-    whole = command(folder, "--workflow-profile", PROFILES / profile, "--retries", "0", *small, "--", "scenes/a")
-    if profile == "slurm":
-        whole[-2:-2] = ["--default-resources", "slurm_partition=nowhere"]
-    done = subprocess.run(whole, env={**environment(), "SBATCH_PARTITION": "nowhere"}, capture_output=True, text=True)
-    last = done.stderr.strip().splitlines()[-1]
-    assert done.returncode == 1 and not missing(last, "error", "sbatch: error"), done.stderr[-3000:]
-
-
-def test_a_job_that_no_node_can_run_is_refused_before_any_is_submitted(batch):
-    folder = batch("too large")
-    cases = (
-        ("slurm", "base=99", ["base", "a", 99, "--set-threads base=12"]),
-        ("slurm-scenes", "room=99", ["a", 14, "--set-threads"]),
-    )
-    for profile, threads, names in cases:
-        small = ["capture=2", "emission=2", "shading=2", "render=2"] if profile == "slurm" else []
-        done, _ = run(folder, profile, "--set-threads", threads, *small, "--", "scenes/a")
-        last = done.stderr.strip().splitlines()[-1]
-        assert done.returncode == 1 and not missing(last, "error", *names), done.stderr[-3000:]
-        assert not jobs() and not (folder / "results/a/capture").exists()
-        assert not list(folder.glob(".snakemake/locks/*"))
-
-
-def test_the_next_attempt_says_that_memory_was_not_enough(tmp_path):
-    first = submit(tmp_path, "hungry", 100, 60, "--mem=300")
-    wait_for(lambda: first not in subprocess.run(["squeue", "-h", "-o", "%A"], capture_output=True, text=True).stdout.split())
-    second = submit(tmp_path, "hungry", 1, 0, "--mem=600")
-    log = tmp_path / f"hungry-{second}.out"
-    ended = rf"attempt 1 \(Slurm job {first} on \S+\) was killed for its memory: it had asked for 300 MB"
-    told = rf"attempt 2, which asks for 600 MB.*: {ended}"
-    wait_for(lambda: log.is_file() and re.search(told, log.read_text()), 60)
-
-
-def test_the_next_attempt_says_that_time_was_not_enough(overdue):
-    folder, first = overdue
-    wait_for(lambda: first not in subprocess.run(["squeue", "-h", "-o", "%A"], capture_output=True, text=True).stdout.split())
-    second = submit(folder, "late", 1, 0, "--time=2", "--mem=300")
-    log = folder / f"late-{second}.out"
-    ended = rf"attempt 1 \(Slurm job {first} on \S+\) was ended at its time limit: it had asked for 300 MB and 1 minute"
-    told = rf"attempt 2, .*: {ended}"
-    wait_for(lambda: log.is_file() and re.search(told, log.read_text()), 60)

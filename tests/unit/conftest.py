@@ -2,19 +2,8 @@
 
 import socket
 from contextlib import ExitStack
-from types import SimpleNamespace
 
 import pytest
-
-
-@pytest.fixture(scope="session")
-def T(llvm):
-    """Public names of the modules of `iif_core.light.transport`, imported after Mitsuba's variant is set."""
-    from iif_core.light.transport import cache, emitters, geometry, materials, matrix, render, scene, shading
-    from tests.oracles import face_materials
-
-    modules = (cache, emitters, face_materials, geometry, materials, matrix, render, scene, shading)
-    return SimpleNamespace(**{name: value for module in modules for name, value in vars(module).items() if name[0] != "_"})
 
 
 @pytest.fixture(scope="session")

@@ -21,9 +21,7 @@ from iif_core.surface.segments import face_adjacency
 from iif_core.surface.triangles import face_geometry
 from tests.workflow.light_room import CELL, Room
 
-OPTIONS = EmissionOptions(
-    seed=0, min_observations=8, cache_edge=0.06, rows=3000, samples=16, max_bounces=6, prune=0.01, solver="direct"
-)
+OPTIONS = EmissionOptions(seed=0, min_observations=8, cache_edge=0.06, rows=3000, samples=16, max_bounces=6, prune=0.01)
 
 
 class Kept(dict):

@@ -9,9 +9,8 @@ from iif_core.camera.response import response
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import Gauge, apply_gauge
 from iif_core.fitting.problem import FitOptions, FitProblem
-from iif_core.fitting.sgd import fit_affines_sgd
 from iif_core.reflectance.material import IDENTITY, apply_affines
-from tests.unit.planted_fit import LEVELS, planted, problem_of, radiance_of, shading_of
+from tests.unit.planted_fit import LEVELS, problem_of, radiance_of, shading_of
 
 
 def _checked(problem, family="identity", **options):
@@ -163,12 +162,3 @@ def test_any_number_of_threads_gives_the_same_bytes():
     problem, _ = problem_of(np.random.default_rng(9), 6, 100, value_of=lambda x: response("gamma")(x), noise=0.1, halves=2)
     first, second = (fit_affines(problem, response("gamma"), FitOptions(iterations=5, threads=t)) for t in (1, 3))
     assert first.affine.tobytes() == second.affine.tobytes() and first.covariance.tobytes() == second.covariance.tobytes()
-
-
-def test_diverging_sgd_is_a_named_result():
-    from iif_core.fitting.sgd import SgdOptions
-
-    problem, _ = problem_of(np.random.default_rng(10), 3, 200, truth=planted(np.random.default_rng(0), 3))
-    with np.errstate(all="ignore"):
-        fit = fit_affines_sgd(problem, response("identity"), SgdOptions(rate=1e308, batch=50))
-    assert not fit.converged and "diverged" in fit.reason and np.isfinite(fit.affine).all()

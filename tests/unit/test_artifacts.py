@@ -215,28 +215,6 @@ def test_forged_notes_of_parts_are_made_again(tmp_path, note):
     assert not (tmp_path / "evil.json").exists() and not (tmp_path.parent / "evil.json").exists()
 
 
-def test_the_state_of_a_killed_job_comes_back_to_the_same_job_alone(tmp_path):
-    folder = tmp_path / "results/s/base"
-    arrays = {"a.b": np.arange(6.0).reshape(2, 3), "live": np.array([True, False]), "none": np.zeros((0, 3))}
-    facts = {"step": 7, "rng": {"state": 2**127 + 1}, "loss": [0.5]}
-    StageWriter(folder, provenance()).keep_state("descent", arrays, facts)
-    again = StageWriter(folder, provenance())
-    found, told = again.kept_state("descent")
-    assert told == facts and found.keys() == arrays.keys()
-    for name, array in arrays.items():
-        np.testing.assert_array_equal(found[name], array)
-        assert found[name].dtype == array.dtype
-    assert StageWriter(folder, provenance() | {"fingerprint": "1" * 16}).kept_state("descent") is None
-    assert again.kept_state("other") is None
-    file = folder / "unfinished/descent.npz"
-    whole = file.read_bytes()
-    for damage in (whole[: len(whole) // 2], b"", b"not an archive", whole[:200] + b"x" * 50 + whole[250:]):
-        file.write_bytes(damage)
-        assert again.kept_state("descent") is None
-    again.finish()
-    assert not file.exists()
-
-
 @pytest.mark.parametrize("name", ["../evil", "maps/../../evil", "/tmp/evil", "", "link/evil"])
 def test_names_that_leave_the_folder_are_refused(tmp_path, name):
     """Whatever the kind of file: relative parts, absolute paths, and links that lead out."""

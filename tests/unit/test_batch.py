@@ -17,8 +17,9 @@ from tests.errors import missing, named, refused
 from workflow import settings
 from workflow.artifacts import StageWriter, sound, stamps
 from workflow.artifacts.files import write_exr, write_json, write_parquet
-from workflow.batch import causes, summary
+from workflow.batch import causes, standing, summary
 from workflow.batch import plan as batch_plan
+from workflow.costs.model import Cost
 from workflow.runtime import fingerprint as fp
 from workflow.runtime.job_state import JobState, reasons
 from workflow.scene.named import check_overrides
@@ -245,7 +246,7 @@ def test_every_scene_is_refused_by_itself(project, monkeypatch):
 
 
 SMALL = "builtin\t\t\tsource.scene=tiny;prior.kind=simulated"
-WRONG_NAME = SMALL + ";overrides={nosuchthing: {metallic: 0}}"
+WRONG_NAME = SMALL + ";materials={nosuchthing: {metallic: 0}}"
 
 
 def segmented(scene):
@@ -273,7 +274,7 @@ def test_what_lies_in_the_folders_of_a_scene_refuses_that_scene_alone(project):
         "file": ["scenes/file"],
         "stage": ["results/stage/render"],
         "logs": ["results/logs/logs"],
-        "name": ["overrides", "'nosuchthing'"],
+        "name": ["materials", "'nosuchthing'"],
         "link": ["scenes/link"],
     }.items():
         named(plan.refused[name], *names)
@@ -302,7 +303,7 @@ def test_the_summary_is_made_again_when_a_scene_or_a_reason_changes(project):
 def gone(state):
     """Give the process of a state another time of start, as after its number was given again."""
     document = json.loads(state.path.read_text())
-    write_json(state.path, document | {"start": document["start"] - 1})
+    write_json(state.path, document | {"start": document["start"] - 9})
 
 
 @pytest.fixture
@@ -315,6 +316,8 @@ def five(project, monkeypatch):
     reason = "config/batch.tsv, line 3: <script>bad\tdata</script>\nsecond line"
     plan = batch_plan.Plan(lines, {n: f"publish of {n}" for n in names if n != "refused"}, {"refused": reason})
     monkeypatch.setattr(batch_plan, "plan", lambda quality: plan)
+    monkeypatch.setattr(standing, "check", lambda scene, quality: ())
+    monkeypatch.setattr(standing.forecast, "job_cost", lambda *job: Cost(None, None, None, None))
 
     write_json(Path("scenes/done/manifest.json"), {"fingerprint": "publish of done"})
     write_json(
@@ -358,7 +361,7 @@ def test_every_scene_has_a_row_that_says_how_it_ended(five):
         "refused": "refused",
         "failed": "failed",
         "killed": "killed",
-        "idle": "not run",
+        "idle": "stale",
     }
     done = rows["done"]
     assert (done["rgb_psnr"], done["rgb_psnr_held_out"], done["albedo_psnr"], done["roughness_l2"]) == ("30", "20", "25", "")
@@ -387,8 +390,8 @@ def test_a_reason_is_one_cell_of_the_table(five, monkeypatch, between):
 def test_a_job_that_runs_is_told_from_a_killed_one(five):
     JobState("idle", "prior", "prior of idle").started()  # by this process
     summary.write_summary("draft")
-    assert "\trunning\tprior\tit runs\t" in Path("results/batch/summary.tsv").read_text()
-    assert "it runs" in Path("results/batch/report.html").read_text()
+    assert "\trunning\tprior\t" in Path("results/batch/summary.tsv").read_text()
+    assert "a job of it runs" in Path("results/batch/report.html").read_text()
 
 
 class _Addresses(HTMLParser):
@@ -410,7 +413,7 @@ def test_the_page_links_to_what_is_here_and_escapes_what_it_is_told(five):
     assert set(page.found) == {
         "#scenes",
         "#verdict=doubtful",
-        *(f"#status={status}" for status in ("done", "refused", "failed", "killed", "not%20run")),
+        *(f"#status={status}" for status in ("done", "refused", "failed", "killed", "stale")),
         "../../scenes/done/report.html",
         "../../results/failed/logs/segmentation.log",
         "../../results/killed/logs/capture.log",
@@ -423,18 +426,18 @@ def test_the_page_links_to_what_is_here_and_escapes_what_it_is_told(five):
 def test_a_deliverable_that_was_changed_is_not_done(five, monkeypatch):
     """Scores and verdict are read from its files, so the table reports none of them."""
     lines = ("scenes/done/verdict.json: its content changed", "scenes/done/scene.glb: missing")
-    monkeypatch.setattr(batch_plan, "plan", lambda quality: replace(five, damaged={"done": lines}))
+    monkeypatch.setattr(standing, "check", lambda scene, quality: lines if scene == "done" else ())
     summary.write_summary("draft")
     with open("results/batch/summary.tsv", newline="") as file:
         row = next(row for row in csv.DictReader(file, delimiter="\t") if row["scene"] == "done")
-    assert (row["status"], row["verdict"], row["rgb_psnr"]) == ("damaged", "", "")
+    assert (row["status"], row["verdict"], row["rgb_psnr"]) == ("stale", "", "")
     assert row["reason"] == f"{lines[0]}, and 1 more"
 
 
 def test_a_damaged_deliverable_is_a_row_and_not_the_end(five):
     Path("scenes/done/metrics.parquet").write_bytes(b"PAR1 rubbish")
     summary.write_summary("draft")
-    assert "`snakemake verify` tells which are damaged" in Path("results/batch/summary.tsv").read_text()
+    assert "its files cannot be read" in Path("results/batch/summary.tsv").read_text()
 
 
 @pytest.mark.parametrize(
@@ -498,9 +501,9 @@ def test_a_published_scene_whose_last_job_failed_says_so(five):
 
 def test_a_part_of_the_prior_that_failed_is_the_reason(five):
     JobState("idle", "prior.3-of-8", "prior of idle").failed("no weights")
-    found = summary._why_not("idle", "draft")
-    assert (found["status"], found["stage"], found["reason"]) == ("failed", "prior", "no weights")
-    assert found["log"] == "results/idle/logs/prior.3-of-8.log"
+    found = standing.standing("idle", lambda _: "draft")
+    assert (found.state, found.stage, found.reason) == ("failed", "prior", "no weights")
+    assert found.log == "results/idle/logs/prior.3-of-8.log"
 
 
 def test_only_a_finished_plan_counts_as_complete(five, monkeypatch):

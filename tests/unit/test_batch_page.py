@@ -6,8 +6,9 @@ import pytest
 from PIL import Image
 
 from tests.browser import DESKTOP, PHONE, axe
-from workflow.batch.columns import SCORES, STATUSES, VERDICTS
+from workflow.batch.columns import SCORES, VERDICTS
 from workflow.batch.page import render
+from workflow.batch.standing import STATES
 from workflow.batch.summary import COLUMNS
 
 
@@ -46,7 +47,7 @@ def write(folder, table):
     for i, name in enumerate(pictures.values()):
         Image.new("RGB", (402, 100), (i % 256, 128, 90)).save(folder / name)
     path = folder / "report.html"
-    path.write_text(render(table, "draft", SCORES, STATUSES, VERDICTS, pictures))
+    path.write_text(render(table, "draft", SCORES, STATES, VERDICTS, pictures))
     return path
 
 

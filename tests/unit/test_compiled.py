@@ -5,6 +5,7 @@ depends on the state of the cache, and their float sums differ in the last bits,
 """
 
 import importlib
+import itertools
 import os
 import pkgutil
 import subprocess
@@ -13,6 +14,7 @@ import sys
 from numba.core.dispatcher import Dispatcher
 
 import iif_core
+import lab.published
 
 PROGRAM = """
 import hashlib
@@ -35,7 +37,8 @@ print(hashlib.sha256(b.tobytes() + votes.tobytes() + kernels.mixture(values, aff
 
 
 def _compiled():
-    for package in pkgutil.walk_packages(iif_core.__path__, "iif_core."):
+    packages = [pkgutil.walk_packages(root.__path__, f"{root.__name__}.") for root in (iif_core, lab.published)]
+    for package in itertools.chain(*packages):
         module = importlib.import_module(package.name)
         for name, value in vars(module).items():
             if isinstance(value, Dispatcher) and value.py_func.__module__ == package.name:

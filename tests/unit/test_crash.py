@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
+from lab.published.state import keep_state
 from tests.errors import missing, refused
 from tests.workflow import crash
 from tests.workflow.faulty_disk import Disk
@@ -125,7 +126,7 @@ def test_the_kernel_refuses_and_it_is_told(tmp_path, small_files, kind):
         "table": lambda writer: writer.table("a.parquet", {"a": values.ravel().astype(np.float32)}),
         "json": lambda writer: writer.json("a.json", values.tolist()),
         "bytes": lambda writer: writer.bytes("a.bin", values.tobytes()),
-        "state": lambda writer: writer.keep_state("a", {"a": values}, {}),
+        "state": lambda writer: keep_state(writer, "a", {"a": values}, {}),
     }[kind]
     writer = StageWriter(tmp_path, {"scene": "s", "stage": "base", "fingerprint": "f"})
     write(writer)

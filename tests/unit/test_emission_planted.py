@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 from iif_core.light.emission.direct import EmissionPrior, solve_emission, solve_families
-from iif_core.light.emission.loss import reference_loss
-from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
 from tests.unit.planted_room import PlantedScene, build_room, relative_errors
 
 
@@ -36,14 +34,3 @@ def test_what_is_never_seen_unsaturated_is_known_by_its_light(planted):
     alone = solve_emission(problem.rows, initial, cross=False)
     error = [np.median(relative_errors(scene.room, s.radiance)) for s in (found, alone)]
     assert error[0] < error[1]
-
-
-def test_twins_are_judged_by_one_loss(planted):
-    scene, photographs, transport = planted
-    problem, initial = scene.problem(photographs, transport, "hdr_hidden")
-    direct = solve_families(problem.rows, EmissionPrior.independent(initial), scene.families())
-    descent = solve_emission_sgd(problem.rows, initial, SgdOptions(steps=600, prune=()))
-    losses = [reference_loss(problem.rows, s.radiance) for s in (direct, descent)]
-    assert losses[0] <= losses[1]
-    assert losses[0] == pytest.approx(reference_loss(problem.rows, scene.room.truth), abs=2e-3)
-    assert descent.radiance.shape == direct.radiance.shape and descent.converged

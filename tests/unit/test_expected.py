@@ -46,11 +46,11 @@ def test_the_whole_is_that_of_the_cost_model(repository, monkeypatch):
     from workflow.runtime import forecast
 
     monkeypatch.chdir(repository)
-    whole = expected.whole("kitchen", "draft")
+    whole = expected.Whole(*forecast.together(expected.STAGES, "kitchen", "draft"))
     costs = [forecast.job_cost(stage, "kitchen", "draft") for stage in expected.STAGES]
     assert whole.cpu_seconds == pytest.approx(sum(cost.cpu_seconds.middle for cost in costs))
     assert whole.memory_mb == max(cost.memory_mb.middle for cost in costs)
-    assert expected.whole("no-such-scene", "draft") is None
+    assert forecast.together(expected.STAGES, "no-such-scene", "draft") is None
 
 
 def test_what_comes_with_the_project_knows_the_components_that_can_be_forced():

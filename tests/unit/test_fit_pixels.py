@@ -51,12 +51,6 @@ def test_objects_get_the_same_number_and_a_larger_draw_contains_a_smaller_one():
     assert number[3] > counts[3] and chosen.interior[chosen.object_id < 3].all()
 
 
-def test_every_pixel_of_an_object_is_taken_where_it_is_asked_for():
-    pixels, mixed = _pixels(), np.arange(10) == 9
-    chosen = FitPixels.every(4, mixed).of(pixels, VIEW)
-    np.testing.assert_array_equal(chosen, np.flatnonzero(pixels.valid & ~mixed[pixels.face]))
-
-
 def test_light_is_found_by_pixel_and_its_absence_is_named():
     rng = np.random.default_rng(1)
     light = SpecularLight(np.array([3, 8, 40]), rng.random((2, 3, 4, 3)), rng.random((2, 3, 4, 3)))

@@ -8,11 +8,11 @@ import pytest
 from iif_core.fusion.direct import solve_direct
 from iif_core.fusion.options import FusionOptions
 from iif_core.fusion.pixels import surface_tangents
-from iif_core.fusion.problem import LOWEST, FusionProblem, one_segment_per_view
+from iif_core.fusion.problem import LOWEST, FusionProblem
 from iif_core.fusion.selection import selection_weights
 from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
 from tests.errors import refused
-from tests.unit.test_fusion_direct import finite, oracle_psnr, simulated
+from tests.unit.test_fusion_direct import simulated
 from workflow.artifacts.scratch import Scratch
 
 
@@ -112,17 +112,6 @@ def test_millimetres_and_kilometres_make_the_same_cells(unit):
     edge = 0.01
     keys = [voxel_indices(points * np.float32(s), edge * s, grid_origin(points * np.float32(s), edge * s)) for s in (1.0, unit)]
     assert (keys[0] == keys[1]).all(1).mean() > 0.995  # float32 rounds a few points over a face
-
-
-def test_one_correction_an_image_underfits():
-    """Objects err differently, so one affine map per image cannot correct them (the paper's ablation)."""
-    problem, truth = simulated()
-    image = one_segment_per_view(problem)
-    assert image.n_segments == len(problem.cell_of_pixel)
-    by_object, by_image = solve_direct(problem), solve_direct(image)
-    assert finite(by_image)
-    assert oracle_psnr(problem, by_object.value, truth) > oracle_psnr(problem, by_image.value, truth)
-    assert by_image.object_value.shape[0] == by_object.object_value.shape[0]
 
 
 def test_memory_bound_changes_nothing(tmp_path):

@@ -17,12 +17,12 @@ KEYS = {"component", "included", "status", "measure", "value", "threshold", "rea
 @pytest.mark.parametrize(
     ("decision", "included"),
     [
-        (light.environment("auto", 0.0, 0.0005, None), False),
-        (light.environment("auto", 0.0, 0.05, None), True),
-        (light.environment("auto", 0.01, 0.0, 0.5), True),
-        (light.environment("auto", 0.01, 0.05, 0.001), False),
-        (light.environment("on", 0.0, 0.0, None), True),
-        (light.environment("off", 0.5, 0.5, 3.0), False),
+        (plan.environment("auto", 0.0, 0.0005, None), False),
+        (plan.environment("auto", 0.0, 0.05, None), True),
+        (plan.environment("auto", 0.01, 0.0, 0.5), True),
+        (plan.environment("auto", 0.01, 0.05, 0.001), False),
+        (plan.environment("on", 0.0, 0.0, None), True),
+        (plan.environment("off", 0.5, 0.5, 3.0), False),
         (light.radiance_cache("auto", 0.7, 0.01), True),
         (light.radiance_cache("auto", 0.1, 0.0), False),
         (light.radiance_cache("path", 0.9, 0.0), False),
@@ -53,7 +53,7 @@ def test_values_say_what_was_measured():
     assert camera.camera_response("ldr", CHOSEN)["reason"] == "gamma it is"
     assert "1 because it pays" in materials.metallic(np.array([True, False]), np.array([0.1, 0.9]))["reason"]
     assert materials.affine_size(["full", "gain+bias", "full"])["reason"] == "2 full, 1 gain+bias"
-    assert light.environment("auto", np.nan, np.nan, None)["value"] == 0.0
+    assert plan.environment("auto", np.nan, np.nan, None)["value"] == 0.0
 
 
 def test_objects_say_how_stable_they_are():
@@ -132,7 +132,7 @@ def test_predictions_settle_what_the_photographs_left_open(lowest, metal, includ
 
 
 def test_the_plan_says_how_to_turn_it_over():
-    assert plan.with_override(plan.specular("auto", OUT))["override"] == "override: {components: {specular: on}}"
+    assert plan.with_override(plan.specular("auto", OUT))["override"] == "components: {specular: on}"
     assert "override" not in plan.with_override(plan.emitters(False, IN))
     assert plan.included([plan.radiance_cache(0.9)], "radiance_cache")["value"] == 0.9
     with pytest.raises(KeyError):
@@ -141,10 +141,3 @@ def test_the_plan_says_how_to_turn_it_over():
 
 def test_a_probe_that_finds_nothing_in_enough_rows_leaves_the_part_out():
     assert plan.specular("auto", Evidence(0.0, 0.0, 900))["included"] is False
-
-
-def test_the_published_method_is_not_planned():
-    of = {item["component"]: item for item in plan.not_planned()}
-    assert of["specular"]["status"] == SETTLED and of["environment"]["status"] == PROVISIONAL
-    later = plan.later(False, True, set(of))
-    assert not {item["component"] for item in later} & set(of)

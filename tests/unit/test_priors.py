@@ -10,7 +10,7 @@ from iif_core.numerics.color import linear_from_srgb
 from iif_core.numerics.filters import fill_from_neighbours
 from tests.errors import refused
 from workflow.artifacts.files import write_exr
-from workflow.priors import files, retinex, simulated
+from workflow.priors import files, retinex
 from workflow.scene.normal_form import View
 
 HEIGHT, WIDTH = 12, 16
@@ -220,17 +220,6 @@ class Capture:
             radiance=albedo,
             valid=np.ones(shape, bool),
         )
-
-
-def test_simulated_spoils_the_truth():
-    prior = SimpleNamespace(samples=3, strength=1.0, shared=1.0)
-    maps = simulated.predict(view(), SimpleNamespace(prior=prior), Capture(), 0)
-    assert maps.shape == (3, HEIGHT, WIDTH, 5) and np.isfinite(maps).all()
-    prior.strength = 0.0
-    exact = simulated.predict(view(), SimpleNamespace(prior=prior), Capture(), 0)
-    np.testing.assert_allclose(exact[2, ..., :3], Capture().truth(None).albedo, atol=1e-7)
-    with refused("prior: {kind: simulated}", "prior: {kind: files}"):
-        simulated.predict(view(), SimpleNamespace(prior=prior), Capture(False), 0)
 
 
 def test_retinex_uses_objects_and_gamma():

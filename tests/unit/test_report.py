@@ -521,7 +521,7 @@ def test_plan_is_collected(toy):
         ("denoiser", False, "forced", "render"),
     ]
     words = {item["component"]: item.get("override") for item in plan["components"]}
-    assert words["denoiser"] == "override: {components: {denoiser: on}}" and words["vignetting"] is None
+    assert words["denoiser"] == "components: {denoiser: on}" and words["vignetting"] is None
 
 
 # ---------------------------------------------------------------------------------------------------------------- page
@@ -646,7 +646,7 @@ def test_downloads_are_told_by_their_names():
 
 
 def test_commands_name_scene_and_quality():
-    words = "override: {components: {specular: off}}"
+    words = "components: {specular: off}"
     said = {c.text for c in commands("room", "standard", [("specular", words)], ["scene.glb"], "room")}
     assert "snakemake --cores 2 relight/room --config quality=standard" in said
     assert {f"snakemake --cores 2 scenes/room --config quality={q}" for q in ("draft", "paper")} <= said

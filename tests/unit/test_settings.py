@@ -34,9 +34,7 @@ def scene(tmp_path):
     ("text", "pixels", "noise"),
     [
         ("affines: {pixels: 5000}", 5000, 0.2),
-        ("affines: {model: object_mean}", 200_000, 0.2),
         ("affines: {texture: photographs}", "all", 0.1),
-        ("affines: {model: fipt}", "all", 0.1),
         ("shading: {pixels: all}", "all", 0.2),
         ("shading: {pixels: 300000}", 300_000, 0.2),
     ],
@@ -59,7 +57,6 @@ def test_noise_of_the_light_can_be_set(scene):
     ("text", "names"),
     [
         ("shading: {pixels: 1000}\naffines: {pixels: 5000}", ["shading: pixels", 1000, "affines: pixels", "`5000`"]),
-        ("shading: {pixels: 1000}\naffines: {model: iris}", ["shading: pixels", 1000, "affines: model: iris", "`all`"]),
         ("shading: {pixels: 1000}\naffines: {texture: photographs}", ["shading: pixels", 1000, "texture", "`all`"]),
         ("shading: {pixels: some}", ["shading.pixels", "'some'", "'auto', 'all'", 100]),
         ("shading: {pixels: 5}", ["shading.pixels", 5, "'auto', 'all'", 100]),
@@ -86,13 +83,10 @@ def test_scene_over_preset_over_default(scene):
         (GOOD + "affines: {VIEWS: 3}\n", ["affines.VIEWS", "batch, epochs, iterations"]),
         (GOOD + "colour: 3\n", ["colour", "affines, base, capture"]),
         (
-            GOOD + "override: {window frame: {metallic: 0}}\n",
-            ["override.window frame", "`overrides`", "components"],
+            GOOD + "override: {components: {specular: off}}\n",
+            ["override", "`components`"],
         ),
-        (
-            GOOD + "overrides: {components: {specular: off}}\n",
-            ["overrides.components.specular", "`override`", "metallic"],
-        ),
+        (GOOD + "overrides: {window frame: {metallic: 0}}\n", ["overrides", "`materials`"]),
         (GOOD + "capture: {views: 0}\n", ["capture.views", 0, 1]),
         (GOOD + "capture: {dynamic_range: mdr}\n", ["capture.dynamic_range", "'mdr'", "'ldr' or 'hdr'"]),
         ("source: {kind: builtin}\nprior: {kind: simulated, samples: 0}\n", ["prior.samples", 0, 1]),
@@ -107,24 +101,13 @@ def test_scene_over_preset_over_default(scene):
         (GOOD + "affines: {scale: {mean_albedo: 3}}\n", ["affines.scale.mean_albedo", 3, 1]),
         ("source: {kind: mitsuba, path: 3}\nprior: {kind: simulated}\n", ["source.path", 3]),
         ("source: {kind: builtn}\nprior: {kind: simulated}\n", ["source.kind", "'builtn'", "builtin"]),
-        (f"{GOOD}affines: {{solver: dirct}}\n", ["affines.solver", "'dirct'", "direct"]),
+        (f"{GOOD}affines: {{response: srg}}\n", ["affines.response", "'srg'", "srgb"]),
         (f"{GOOD}affines: {{pixels: some}}\n", ["affines.pixels", "'some'", "'all'", 100]),
         ("prior: {kind: simulated}\n", ["source", "config/scenes/kitchen.yaml"]),
         ("source: {kind: builtin\n", ["line 2", "YAML"]),
         ("- a\n- b\n", ["list", "key: value"]),
         (GOOD + "capture: {views: 3, views: 5}\n", ["line 3", "`views`"]),
         ("source: builtin\nprior: {kind: simulated}\n", ["source", "'builtin'", "source: {kind: ...}"]),
-        (GOOD + "base: {iterations: 100}\n", ["`base`", "`iterations`", "solver: sgd", "solver: direct"]),
-        (GOOD + "base: {solver: sgd, sweeps: 3}\n", ["`base`", "`sweeps`", "solver: direct", "solver: sgd"]),
-        (GOOD + "emission: {iterations: 5}\n", ["`emission`", "`iterations`", "solver: sgd", "solver: direct"]),
-        (GOOD + "emission: {preset: paper}\n", ["`emission`", "`preset`", "solver: sgd"]),
-        (GOOD + "affines: {epochs: 5, rate: 1}\n", ["`affines`", "`epochs`, `rate`", "solver: sgd"]),
-        (
-            GOOD + "affines: {solver: adam, robust_width: 1}\n",
-            ["`affines`", "`robust_width`", "solver: direct", "solver: adam"],
-        ),
-        (GOOD + "affines: {model: fipt, scale: prior}\n", ["`affines`", "`scale`", "model: objects", "model: fipt"]),
-        (GOOD + "affines: {model: iris, solver: adam, epochs: 9}\n", ["`affines`", "`epochs`", "model: objects", "model: iris"]),
         (GOOD + "metrics: {views: 0}\n", ["metrics.views", 0, 1]),
         (GOOD + "affines: {ridge: 0.1}\n", ["affines.ridge"]),
         (GOOD + "base: {predictions: 99}\n", ["base: predictions", 99, "`prior`", 8]),
@@ -152,32 +135,16 @@ def test_scene_file_that_is_not_utf8(scene):
         settings.load("x", "draft", root)
 
 
-def test_a_value_that_equals_the_default_is_never_idle(scene):
-    root = scene(GOOD + "affines: {model: fipt, iterations: 60}\nbase: {solver: sgd, sweeps: 9}\n")
-    assert settings.load("x", "draft", root).affines.iterations == 60
-
-
-def test_a_choice_drops_what_lower_layers_set_for_the_other_one(scene):
-    """A preset that sets a number for the direct solver must not forbid a scene to use another solver."""
-    root = scene(GOOD + "affines: {solver: sgd}\n", "affines: {iterations: 7, pixels: 500}\n")
-    got = settings.load("x", "draft", root).affines
-    assert (got.solver, got.iterations, got.pixels) == ("sgd", 60, 500)
-
-
 def test_defaults_are_those_of_the_solvers(repository):
     from iif_core.fitting.problem import FitOptions
-    from iif_core.fitting.sgd import SgdOptions
-    from iif_core.light.emission import sgd
 
     tree = settings.SceneSettings(source={"kind": "builtin"}, prior={"kind": "simulated"})
     for section, options in (
         (tree.affines, FitOptions()),
-        (tree.affines, SgdOptions()),
         (tree.base, FusionOptions()),
     ):
         shared = set(type(section).model_fields) & {field.name for field in fields(options)}
         assert {name: getattr(section, name) for name in shared} == {name: getattr(options, name) for name in shared}
-    assert tree.emission.preset == sgd.SgdOptions().preset
 
 
 def test_a_folder_without_configuration_uses_that_of_the_repository(tmp_path, repository):
@@ -218,14 +185,9 @@ def test_unknown_scene_suggests(scene):
         settings.load("xx", "draft", root)
 
 
-def test_shipped_scenes_and_studies_load_at_every_quality(repository):
-    for quality in settings.QUALITIES:
-        for name in settings.scene_names(repository):
-            settings.load(name, quality, repository)
-        for name in study_files.study_names(repository):
-            study = study_files.load_study(name, repository)
-            for scene, variant in itertools.product(study.scenes, study.variants):
-                settings.load(study_files.scene_of(name, scene, variant, 0), quality, repository)
+def test_shipped_scenes_load_at_every_quality(repository):
+    for quality, name in itertools.product(settings.QUALITIES, settings.scene_names(repository)):
+        settings.load(name, quality, repository)
 
 
 def test_the_kitchen_can_be_relit_as_it_is_shipped(repository):
@@ -248,41 +210,6 @@ def test_registry_is_ordered_and_its_settings_exist(repository):
     document = settings.dump(settings.load("kitchen", "draft", repository))
     for stage in STAGES.values():
         settings.select(document, stage.settings)
-
-
-def test_a_preset_lies_below_the_file_that_names_it(scene):
-    root = scene(GOOD + "preset: published\nemission: {iterations: 7}\n", "affines: {pixels: 500}\nemission: {samples: 4}\n")
-    got = settings.load("x", "draft", root)
-    solvers = got.base.solver, got.emission.solver, got.affines.solver
-    assert (got.preset, *solvers) == ("published", "sgd", "published", "published")
-    assert (got.emission.samples, got.emission.iterations, got.affines.pixels, got.shading.pixels) == (128, 7, "all", "all")
-    repaired = settings.load("x", "draft", scene(GOOD + "preset: published_repaired\n"))
-    assert (repaired.base.preset, repaired.base.texture, repaired.emission.solver) == ("safe", "hashgrid", "published_repaired")
-
-
-def test_a_setting_of_ours_beside_a_preset_is_idle(scene):
-    with refused("emission", "prune", "solver: direct", "sgd", "solver: published"):
-        settings.load("x", "draft", scene(GOOD + "preset: published\nemission: {prune: 0.2}\n"))
-    with refused("shading", "levels", "method: shared_paths", "method: published"):
-        settings.load("x", "draft", scene(GOOD + "preset: published\nshading: {levels: 4}\n"))
-    with refused("emission: solver: published", "affines: response"):
-        settings.load("x", "draft", scene(GOOD + "preset: published\naffines: {response: {file: c.csv}}\n"))
-    with refused("emission: solver: published", "capture: {dynamic_range: ldr}"):
-        settings.load("x", "draft", scene(GOOD + "preset: published\ncapture: {dynamic_range: hdr}\n"))
-    with refused("preset", "'theirs'", "'published'"):
-        settings.load("x", "draft", scene(GOOD + "preset: theirs\n"))
-
-
-def test_mistakes_beside_a_preset_are_those_of_the_file_that_names_it(scene):
-    for text, names in (
-        ("capture: {dynamic_range: hdr}\n", ["capture: {dynamic_range: ldr}"]),
-        ("emission: {prune: 0.2}\n", ["prune"]),
-    ):
-        with refused("config/scenes/x.yaml", *names):
-            settings.load("x", "draft", scene(GOOD + "preset: published\n" + text))
-    root = scene(GOOD + "affines: {model: no_such}\n", "preset: published\n")  # the quality names it
-    with refused("config/scenes/x.yaml", "affines.model", "'no_such'"):
-        settings.load("x", "draft", root)
 
 
 def test_yaml_is_read_alike_with_and_without_libyaml(tmp_path, monkeypatch):
@@ -314,22 +241,18 @@ def test_yaml_is_read_alike_with_and_without_libyaml(tmp_path, monkeypatch):
     ],
 )
 def test_a_forced_component_is_the_setting_of_its_own(scene, words, section, key, value):
-    found = settings.load("x", "draft", scene(f"{GOOD}override: {{components: {{{words}}}}}\n"))
+    found = settings.load("x", "draft", scene(f"{GOOD}components: {{{words}}}\n"))
     assert getattr(getattr(found, section), key) == value
 
 
 @pytest.mark.parametrize(
     ("text", "names"),
     [
-        ("override: {components: {environment: off}}\nemission: {environment: on}", ["override", "emission: environment: on"]),
-        ("override: {components: {denoiser: on}}\nrender: {denoise: false}", ["override", "render: denoise: False"]),
-        ("override: {components: {metallic: on}}", ["override.components.metallic", "'on'", "'auto' or 'off'"]),
-        ("override: {components: {gloss: off}}", ["override.components.gloss", "specular"]),
-        ("override: {components: {specular: maybe}}", ["override.components.specular", "'maybe'", "'auto', 'on' or 'off'"]),
-        (
-            "capture: {dynamic_range: ldr}\npreset: published\noverride: {components: {specular: off}}",
-            ["override: components: specular"],
-        ),
+        ("components: {environment: off}\nemission: {environment: on}", ["components", "emission: environment: on"]),
+        ("components: {denoiser: on}\nrender: {denoise: false}", ["components", "render: denoise: False"]),
+        ("components: {metallic: on}", ["components.metallic", "'on'", "'auto' or 'off'"]),
+        ("components: {gloss: off}", ["components.gloss", "specular"]),
+        ("components: {specular: maybe}", ["components.specular", "'maybe'", "'auto', 'on' or 'off'"]),
     ],
 )
 def test_an_override_that_cannot_be(scene, text, names):
@@ -354,11 +277,11 @@ def test_limits_of_a_scene_hold_for_every_quality_and_raise_nothing(repository, 
 @pytest.mark.parametrize(
     ("draft", "names"),
     [
-        ("point: draft\n", ["point", "'draft'", "p01"]),
-        ("point: nowhere\n", ["point", "'nowhere'", "p01"]),
-        ("point: [p01]\n", ["point", "['p01']"]),
+        ("quality: draft\n", ["quality", "'draft'", "p01"]),
+        ("quality: nowhere\n", ["quality", "'nowhere'", "p01"]),
+        ("quality: [p01]\n", ["quality", "['p01']"]),
         ("capture: {veiws: 3}\n", ["capture.veiws", "`views`"]),
-        ("point: p01\nmetrics: {veiws: 3}\n", ["metrics.veiws", "`views`"]),
+        ("quality: p01\nmetrics: {veiws: 3}\n", ["metrics.veiws", "`views`"]),
     ],
 )
 def test_mistakes_in_a_quality_are_blamed_on_its_file(tmp_path, draft, names):
@@ -375,11 +298,11 @@ def test_a_quality_may_be_a_point_with_a_change_and_a_point_alone_is_known_by_it
         (tmp_path / "config" / part).mkdir(parents=True)
     (tmp_path / "config/scenes/t.yaml").write_text("source: {kind: builtin, scene: tiny}\nprior: {kind: simulated}\n")
     (tmp_path / "config/quality/p91.yaml").write_text("capture: {views: 9, width: 90}\nprior: {samples: 3}\n")
-    (tmp_path / "config/quality/draft.yaml").write_text("point: p91\ncapture: {views: 7}\n")
+    (tmp_path / "config/quality/draft.yaml").write_text("quality: p91\ncapture: {views: 7}\n")
     found = settings.load("t", "draft", tmp_path)
     assert (found.capture.views, found.capture.width, found.prior.samples) == (7, 90, 3)
     assert loading.canonical("p91", tmp_path) == "p91"
-    (tmp_path / "config/quality/draft.yaml").write_text("point: p91\n")
+    (tmp_path / "config/quality/draft.yaml").write_text("quality: p91\n")
     assert loading.canonical("p91", tmp_path) == "draft" and loading.canonical("paper", tmp_path) == "paper"
     assert loading.overridden("t", "p91", tmp_path) == []
     (tmp_path / "config/scenes/t.yaml").write_text("source: {kind: builtin, scene: tiny}\nprior: {kind: simulated, samples: 5}\n")
@@ -399,25 +322,6 @@ def test_a_bench_of_a_scene_that_is_not_there_says_so(tmp_path):
 def test_a_comparison_needs_two_names(repository):
     with refused("compare/kitchen", "compare/kitchen,country-kitchen"):
         settings.refuse_target("compare/kitchen", [], repository)
-
-
-def test_a_workflow_profile_that_is_not_there_is_refused(repository, tmp_path):
-    """Snakemake passes over it, and runs with the settings of none."""
-    for given in ("none", "default", "workflow/profiles/slurm-scenes", "workflow/profiles/slurm/config.yaml"):
-        settings.refuse_profile(given, repository, repository)
-    settings.refuse_profile(str(repository / "workflow/profiles/slurm"), tmp_path, repository)
-    with refused("--workflow-profile workflow/profiles/slurm-scene", "workflow/profiles/slurm-scenes"):
-        settings.refuse_profile("workflow/profiles/slurm-scene", repository, repository)
-    with refused("--workflow-profile workflow/profiles/slurm", tmp_path, repository / "workflow/profiles/slurm-scenes"):
-        settings.refuse_profile("workflow/profiles/slurm", tmp_path, repository)
-
-
-def test_a_name_that_nothing_is_scattered_by_is_refused():
-    settings.refuse_scatter({"prior": 8}, ("prior",))
-    with refused("--set-scatter prior=0", 1):
-        settings.refuse_scatter({"prior": 0}, ("prior",))
-    with refused("--set-scatter piror", "prior"):
-        settings.refuse_scatter({"piror": 8}, ("prior",))
 
 
 def test_the_profiles_of_slurm_know_every_stage(repository):

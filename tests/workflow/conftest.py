@@ -16,7 +16,7 @@ def finished(repository, tmp_path_factory, worker_id) -> Workflow:
         fcntl.flock(lock, fcntl.LOCK_EX)  # the other processes wait here until the run is there
         if not (workflow.folder / "scenes/tiny").is_dir():
             workflow.write("tiny", TINY)
-            result = workflow.run("scenes/tiny", "--config", f"events={shared / 'tiny.events.jsonl'}")
+            result = workflow.run("scenes/tiny")
             assert result.returncode == 0, result.stderr[-4000:]
     return workflow
 

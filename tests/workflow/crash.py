@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
+from lab.published.state import keep_state, kept_state
 from tests.workflow.faulty_disk import HOSTILE, Disk, Fault, lay_out, tree
 from workflow.artifacts import StageReader, StageWriter, sound, stamps
 from workflow.artifacts import files as io
@@ -74,11 +75,11 @@ def perform(mark: str) -> None:
     if writer.part_kept("lamp", "digest") is None:
         writer.json("lamps/lamp.json", [1, 2])
         writer.part_done("lamp", ["lamps/lamp.json"], {}, "digest")
-    state = writer.kept_state("descent")
+    state = kept_state(writer, "descent")
     value, step = (state[0]["value"], state[1]["step"]) if state else (np.full(3, number % 97, np.float64), 0)
     for done in range(step, 2):
         value = value * 1.25 + 1
-        writer.keep_state("descent", {"value": value}, {"step": done + 1})
+        keep_state(writer, "descent", {"value": value}, {"step": done + 1})
     writer.table("cells.parquet", {"value": value, "k": np.arange(3)})
     writer.json("facts.json", said)
     writer.bytes("page.html", b"<p>" + bytes(mark, "ascii"))

@@ -138,7 +138,7 @@ class StubJob:
     def __init__(self, stage: str, folder: Path, settings: dict[str, Any], seed: int = 0):
         self.stage, self.folder, self.seed, self.threads, self.scene = STAGES.get(stage), folder, seed, 2, "room"
         self.document = {"seed": seed}
-        known = {"prior": {"kind": "simulated"}, "override": {"components": SimpleNamespace(metallic="auto")}, "overrides": {}}
+        known = {"prior": {"kind": "simulated"}, "components": SimpleNamespace(metallic="auto"), "materials": {}}
         known |= {"segmentation": {"kind": "given"}} | settings
         self.settings = SimpleNamespace(**{k: SimpleNamespace(**v) for k, v in known.items()})
         self.log = logging.getLogger(stage)
@@ -349,9 +349,6 @@ EMISSION = {
     "samples": 16,
     "prune": 0.01,
     "environment": "auto",
-    "solver": "direct",
-    "preset": "safe",
-    "iterations": 2000,
 }
 SHADING = {
     "pixels": "all",
@@ -360,11 +357,10 @@ SHADING = {
     "cell_edge": 0.05,
     "noise": 0.15,
     "max_samples": 512,
-    "method": "shared_paths",
     "max_bounces": 6,
     "indirect": "auto",
 }
 AFFINES = {
-    **{"model": "objects", "solver": "direct", "response": "auto", "iterations": 60, "pixels": 200000, "population": True},
-    **{"ridge": 2e-3, "robust_width": 0.1, "scale": "found", "texture": "base", "epochs": 3, "batch": 32768, "rate": None},
+    **{"response": "auto", "iterations": 60, "pixels": 200000, "population": True},
+    **{"ridge": 2e-3, "robust_width": 0.1, "scale": "found", "texture": "base"},
 }

@@ -319,9 +319,9 @@ def test_known_scale_of_a_lamp_and_of_a_patch(hdr):
 
 
 PLANNED = {
-    "override": {"components": SimpleNamespace(specular="auto", metallic="auto")},
-    "emission": {**EMISSION, "environment": "auto", "saturation": 0.99, "solver": "direct"},
-    "shading": {**SHADING, "method": "shared_paths"},
+    "components": SimpleNamespace(specular="auto", metallic="auto"),
+    "emission": {**EMISSION, "environment": "auto", "saturation": 0.99},
+    "shading": SHADING,
 }
 
 

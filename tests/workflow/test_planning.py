@@ -5,7 +5,7 @@ import json
 import yaml
 from support import planned
 
-OFF = "override: {components: {specular: off, denoiser: off}}\n"
+OFF = "components: {specular: off, denoiser: off}\n"
 
 
 def test_the_plan_needs_capture_alone_and_is_shown(workflow):
@@ -18,7 +18,7 @@ def test_the_plan_needs_capture_alone_and_is_shown(workflow):
     of = {item["component"]: item for item in shown["components"]}
     assert of["environment"]["status"] == "settled" and "closed" in of["environment"]["reason"]
     assert of["camera_response"]["included"] is False  # linear photographs
-    assert of["metallic"]["status"] == "provisional" and of["metallic"]["override"].startswith("override: {components")
+    assert of["metallic"]["status"] == "provisional" and of["metallic"]["override"].startswith("components: {")
     expected = of["radiance_cache"]["expected"]
     assert expected["rooms"] >= 3 and "cpu_seconds" in expected and len(expected["held_out_db_range"]) == 2
     assert not planned(workflow.run("-n", "plan/tiny"))
@@ -32,7 +32,7 @@ def test_the_plan_needs_capture_alone_and_is_shown(workflow):
 def test_what_is_left_out_is_not_done_and_its_reruns_are_the_least(workflow):
     path = workflow.folder / "config/scenes/tiny.yaml"
     text = path.read_text()
-    path.write_text(text + "override: {components: {metallic: off}}\n")
+    path.write_text(text + "components: {metallic: off}\n")
     again = planned(workflow.run("-n", "scenes/tiny"))
     assert "affines" in again and not again & {"capture", "plan", "base", "emission", "shading"}
     path.write_text(text + OFF)

@@ -114,10 +114,10 @@ def test_mistakes_stop_before_any_job(workflow, text, names):
 def test_a_correction_by_hand_reruns_the_fit_alone(workflow):
     path = workflow.folder / "config/scenes/tiny.yaml"
     text = path.read_text()
-    path.write_text(text + "overrides: {tabel: {metallic: 1}}\n")
+    path.write_text(text + "materials: {tabel: {metallic: 1}}\n")
     wrong = workflow.run("scenes/tiny", "-n")
-    named(error_of(wrong), "overrides", "'tabel'")
-    path.write_text(text + "overrides: {0: {metallic: 0, roughness: 0.6}}\n")
+    named(error_of(wrong), "materials", "'tabel'")
+    path.write_text(text + "materials: {0: {metallic: 0, roughness: 0.6}}\n")
     assert planned(workflow.run("scenes/tiny", "-n")) == {"affines", "render", "metrics", "export", "room", "report", "publish"}
     result = workflow.run("results/tiny/affines/manifest.json")
     assert result.returncode == 0, result.stderr[-3000:]

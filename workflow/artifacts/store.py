@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -148,31 +148,6 @@ class StageWriter:
         if by:
             self.parts[part] = done
         return done["facts"]
-
-    def keep_state(self, name: str, arrays: Mapping[str, np.ndarray], facts: Any) -> None:
-        """Write down how far a long computation has come. After a kill the next job continues from there; `finish` removes it."""
-        document = json.dumps({"by": self.provenance["fingerprint"], "facts": facts})
-
-        def write(path: Path) -> None:
-            with path.open("wb") as file:  # or NumPy would append .npz to the name
-                np.savez(file, **{f"array.{key}": array for key, array in arrays.items()}, document=np.array(document))
-
-        path = io.inside(self.directory, f"{UNFINISHED}/{name}.npz")
-        for left in path.parent.glob(f".{path.stem}.*"):  # by a job that was killed while it wrote
-            left.unlink(missing_ok=True)
-        io.write_atomically(path, write, settled=False)
-
-    def kept_state(self, name: str) -> tuple[dict[str, np.ndarray], Any] | None:
-        """Return arrays and facts of `keep_state`; None if there is nothing, or nothing that this job can go on from: it was
-        written under another fingerprint, or is damaged."""
-        try:
-            with np.load(io.inside(self.directory, f"{UNFINISHED}/{name}.npz"), allow_pickle=False) as kept:
-                document = json.loads(str(kept["document"]))
-                if document["by"] != self.provenance["fingerprint"]:
-                    return None
-                return {key.removeprefix("array."): kept[key] for key in kept.files if key != "document"}, document["facts"]
-        except Exception:  # whatever zipfile and NumPy make of a damaged archive: the work begins again
-            return None
 
     def channels(self, name: str) -> dict[str, np.ndarray]:
         """Return the channels of a raster that this stage has written or taken over."""

@@ -10,12 +10,12 @@ from typing import Any
 FEW = 10
 """Largest number of scenes that are listed one by one; of more, the causes are listed."""
 ELLIPSIS = "…"
-_PATH = re.compile(r"[^\s'\"`(),;:=]*/[^\s'\"`(),;:]*")
-_FILE = re.compile(r"(?<![\w`.])[\w-]+(?:\.[\w-]+)*\.(?:exr|png|jpe?g|json|parquet|ply|obj|glb|yaml|tsv|npz|txt|xml|bin)\b", re.I)
-_NUMBER = re.compile(r"(\b(?:error|errno|code|signal) )?[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?", re.I)
-_SEEN = re.compile(r"[;:]? (?:it|this process) had [\d,]+ MB when last seen", re.I)  # `attempts.py`
-_WITH_DIGITS = re.compile(rf"[\w-]*{ELLIPSIS}[\w-]*(?:{ELLIPSIS}[\w-]*)*")
-_SEVERAL = re.compile(rf"{ELLIPSIS}(?:(?:, and |, | and | x | to | ){ELLIPSIS})+")
+_ENDINGS = "exr|png|jpe?g|json|parquet|ply|obj|glb|yaml"
+_EDGE = r"\s'\"`(),;:="
+_VARIES = re.compile(rf"(?<!error )(?<![^{_EDGE}])[^{_EDGE}]*(?:[/\d][^\s'\"`(),;:]*|\.(?:{_ENDINGS})\b)", re.I)
+"""Words that hold a slash, a digit or an ending of files: paths, names of views, numbers. Numbers of errors (`error 2`) stay."""
+_SEEN = re.compile(r"[;:.]? ?(?:it|this process) had [\d,]+ MB when last seen", re.I)
+_SEVERAL = re.compile(rf"{ELLIPSIS}(?:(?:, and | and | x | to |,? ){ELLIPSIS})+")
 
 Row = Mapping[str, Any]
 
@@ -41,30 +41,18 @@ class Group:
         count = f"{len(self.rows)} scene{'s' if len(self.rows) > 1 else ''}"
         return f"{count} {self.status}{f' in {self.stage}' if self.stage else ''}"
 
-    @property
-    def example(self) -> Row:
-        return self.rows[0]
-
 
 def cause_of(reason: str, scene: str) -> str:
-    """Return the reason without paths, names of files, views and scenes, and numbers: an ellipsis stands for each.
-
-    Keys of settings and other words stay, and so do numbers of errors, such as `CUDA error 700`. Of a reason of several lines the
-    first counts.
+    """Return the first line of a reason with an ellipsis for each path, name of a file, view or scene, and number.
 
     >>> cause_of("data/a-1/mesh.ply is 5590 m across; allowed: 1 to 300", "a-1")
     '… is … m across; allowed: …'
     """
-    text = reason.strip().partition("\n")[0]
-    text = _PATH.sub(ELLIPSIS, _SEEN.sub("", text))
-    text = _FILE.sub(ELLIPSIS, text)
-    text = re.sub(rf"(?<=scene )['\"]?{re.escape(scene)}\b['\"]?|(?<=['\"]){re.escape(scene)}(?=['\"])", ELLIPSIS, text)
-    text = re.sub(rf"(\bstage [\w-]+ of ){re.escape(scene)}(?![\w-])", rf"\1{ELLIPSIS}", text)
-    if not scene.isalpha():  # a scene called `mesh` must not hide the word
-        text = re.sub(rf"(?<![\w-]){re.escape(scene)}(?![\w-])", ELLIPSIS, text)
-    text = _NUMBER.sub(lambda found: found[0] if found[1] else ELLIPSIS, text)
-    text = _WITH_DIGITS.sub(ELLIPSIS, text)
-    return _SEVERAL.sub(ELLIPSIS, text)
+    text = _SEEN.sub("", reason.strip().partition("\n")[0])
+    anywhere = "" if scene.isalpha() else "?"  # a scene called `mesh` must not hide the word
+    named = rf"(?<![\w-])((?:scene|of) ['\"]?){anywhere}{re.escape(scene)}(?![\w-])"
+    text = re.sub(named, lambda found: f"{found[1] or ''}{ELLIPSIS}", text)
+    return _SEVERAL.sub(ELLIPSIS, _VARIES.sub(ELLIPSIS, text))
 
 
 def groups(rows: Iterable[Row]) -> list[Group]:
@@ -107,12 +95,11 @@ def _is_told(row: Row) -> bool:
     return row["status"] != "done" or bool(row["reason"])
 
 
+def _told(group: Group) -> str:
+    first = group.rows[0]
+    return f"{group.heading}, such as {first['scene']}: {first['reason']}" if len(group.rows) > 1 else _line(first)
+
+
 def _line(row: Row) -> str:
     where = f" in {row['stage']}" if row["stage"] else ""
     return f"{row['scene']}: {row['status']}{where}: {row['reason']}"
-
-
-def _told(group: Group) -> str:
-    if len(group.rows) == 1:
-        return _line(group.example)
-    return f"{group.heading}, such as {group.example['scene']}: {group.example['reason']}"

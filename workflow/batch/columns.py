@@ -7,17 +7,6 @@ from typing import NamedTuple
 from iif_core.evaluation.catalogue import METRICS
 from workflow.report.verdict import AMBER, GREEN, RED, WORDS
 
-STATUSES = {
-    "done": "published, as the settings, inputs and code of now would make it",
-    "damaged": "published, and not what was written any more; the next run publishes it again",
-    "refused": "its settings or data cannot be used; no job is started",
-    "failed": "a job ended with an error",
-    "killed": "a job started but did not end, and its process no longer exists (memory, time limit, node)",
-    "running": "a job of it runs",
-    "not run": "jobs are missing and none of them has run as it would now",
-}
-
-
 VERDICTS = {
     WORDS[GREEN]: "no check of its report found a fault",
     WORDS[AMBER]: "usable with care: a check of its report is in doubt",

@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from workflow.artifacts.files import is_inside, read_record, sha256_of
 from workflow.batch.page import FILES
 from workflow.runtime import fingerprint as fp
 from workflow.runtime import input_digests
-from workflow.runtime.attempts import written_out
+from workflow.runtime.job_state import written_out
 from workflow.scene.named import check_overrides
 from workflow.settings.batch_table import Line, read_table
 
@@ -27,13 +27,11 @@ WRITTEN = ("summary.parquet", "summary.tsv", "report.html")
 
 @dataclass(frozen=True)
 class Plan:
-    """The lines of the table; scene -> fingerprint of its deliverable; scene that cannot be run -> reason; scene of which what is
-    published was damaged -> what is wrong, a line for each file."""
+    """The lines of the table; scene -> fingerprint of its deliverable; scene that cannot be run -> reason."""
 
     lines: tuple[Line, ...]
     ready: dict[str, str]
     refused: dict[str, str]
-    damaged: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 @lru_cache(None)
@@ -45,7 +43,7 @@ def plan(quality: str) -> Plan:
         InputError: the table itself cannot be read (`read_table`).
     """
     lines = read_table()
-    ready, refused, damaged = {}, {}, {}
+    ready, refused = {}, {}
     said = time.monotonic()
     with input_digests.saved_once():
         for done, line in enumerate(lines):
@@ -54,16 +52,14 @@ def plan(quality: str) -> Plan:
                 print(f"batch: {done} of {len(lines)} scenes checked", file=sys.stderr)
             try:
                 mark = fp.fingerprint("publish", line.name, quality)
-                faults = check(line.name, quality)
+                check(line.name, quality)
                 ready[line.name] = mark
-                if told := tuple(filter(None, faults)):
-                    damaged[line.name] = told
             except InputError as error:
                 refused[line.name] = str(error) if line.at() in str(error) or not line.number else f"{line.at()}: {error}"
             except Exception as error:  # whatever is wrong with one scene must not stop hundreds of others
                 reason = f"{line.at() + ': ' if line.number else ''}{type(error).__name__}: {error} (a bug: please report it)"
                 refused[line.name] = written_out(reason)
-    return Plan(lines, ready, refused, damaged)
+    return Plan(lines, ready, refused)
 
 
 def faults_of_the_summary() -> tuple[str, ...]:
@@ -100,7 +96,7 @@ def check_stage(stage: str, scene: str, quality: str) -> tuple[str, ...]:
     """Check what of a stage lies in results/, and return what is wrong with it that making it again mends (`stage_faults`).
 
     Raises:
-        InputError: a file is in the way, the stage is of an earlier version, or `overrides` names what is not there.
+        InputError: a file is in the way, the stage is of an earlier version, or `materials` names what is not there.
     """
     mark = fp.fingerprint(stage, scene, quality)
     links.check_folders(Path("results"), scene, stage)

@@ -9,7 +9,6 @@ import csv
 import io
 import json
 import logging
-import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -19,11 +18,11 @@ from iif_core.errors import InputError
 from workflow.artifacts.files import read_parquet, read_record, remove, sha256_of, write_atomically
 from workflow.batch import causes
 from workflow.batch import plan as batch_plan
-from workflow.batch.columns import SCORES, STATUSES, VERDICTS
+from workflow.batch.columns import SCORES, VERDICTS
 from workflow.batch.page import render, write_pictures
-from workflow.runtime import attempts
+from workflow.batch.standing import STATES, standing
 from workflow.runtime import fingerprint as fp
-from workflow.runtime.job_state import noted, state_file
+from workflow.runtime.job_state import SILENCE, written_out
 from workflow.runtime.timings import read_parts, read_timings
 from workflow.settings.batch_table import Line
 
@@ -41,7 +40,7 @@ COLUMNS = {
 Row = dict[str, Any]
 
 
-def write_summary(quality: str, complete: str | None = None) -> None:
+def write_summary(quality: str, complete: str | None = None, over: bool = False) -> None:
     """Write table and page, and log which scenes are not done, and why.
 
     Args:
@@ -49,17 +48,18 @@ def write_summary(quality: str, complete: str | None = None) -> None:
         complete: fingerprint of the plan, when all its jobs are done; it is kept with the digests of all files. Without it,
             `results/batch/complete` is removed, so that Snakemake does not take what a failed run left for the summary of a
             finished one.
+        over: whether the run is over: a job that has not ended by now was killed, also on another machine.
 
     Raises:
         InputError: `complete` is given, and a scene is not done nevertheless.
     """
     remove(FOLDER / "complete")
     plan = batch_plan.plan(quality)
-    rows = [row_of(line, plan, quality) for line in plan.lines]
+    rows = [row_of(line, plan, quality, 0.0 if over else SILENCE) for line in plan.lines]
     write_atomically(FOLDER / "summary.parquet", partial(_write_parquet, rows))
     write_atomically(FOLDER / "summary.tsv", lambda path: path.write_text(_tsv(rows), encoding="utf-8"))
     pictures = write_pictures([row["scene"] for row in rows if row["status"] == "done"], FOLDER)
-    page = render(rows, quality, SCORES, STATUSES, VERDICTS, pictures)
+    page = render(rows, quality, SCORES, STATES, VERDICTS, pictures)
     write_atomically(FOLDER / "report.html", lambda path: path.write_text(page, encoding="utf-8"))
     logging.getLogger("batch").info("%s", closing(rows))
     if not complete:
@@ -92,88 +92,39 @@ def closing(rows: Sequence[Row]) -> str:
     words = ", ".join(f"{count} {word}" for word, count in judged.items() if count)
     verdicts = f" ({words}, by their reports)" if words else ""
     lines = [f"{len(done)} of {len(rows)} scenes done{verdicts}; {FOLDER / 'report.html'}, {FOLDER / 'summary.tsv'}"]
-    return attempts.written_out("\n".join([*lines, *causes.lines(rows)]))
+    return written_out("\n".join([*lines, *causes.lines(rows)]))
 
 
 # ------------------------------------------------------------------------------------------------------------ one scene
 
 
-def row_of(line: Line, plan: batch_plan.Plan, quality: str) -> Row:
-    """Return the row of one scene; what is unknown is None. Never raises, whatever the files of the scene hold."""
+def row_of(line: Line, plan: batch_plan.Plan, quality: str, silence: float = SILENCE) -> Row:
+    """Return the row of one scene; what is unknown is None. Never raises, whatever the files of the scene hold.
+
+    Args:
+        line: of the table.
+        plan: of the batch.
+        quality: preset of the batch.
+        silence: as of `workflow.runtime.job_state.noted`.
+    """
     scene = line.name
     row: Row = dict.fromkeys(COLUMNS)
     row |= {"line": line.number, "scene": scene, "base": line.base or None, "quality": quality}
     if scene in plan.refused:
         return row | {"status": "refused", "reason": plan.refused[scene], "source": line.source or None}
     row["source"] = json.loads(fp.resolved(scene, quality))["source"]["kind"]
+    found = standing(scene, lambda _: quality, silence)
+    reason = found.reason or (f"stage {found.stage} has not run" if found.state == "waiting" else None)
+    row |= {"status": found.state, "stage": found.stage or None, "reason": reason}
+    if found.reason and found.log:
+        row["log"] = found.log
     try:
         row |= _costs(scene)
-        if faults := plan.damaged.get(scene):
-            more = f", and {len(faults) - 1} more" if len(faults) > 1 else ""
-            return row | {"status": "damaged", "stage": "publish", "reason": faults[0] + more}
-        if not _is_published(scene, plan.ready[scene]):
-            return row | _why_not(scene, quality)
-        return row | {
-            "status": "done",
-            "report": f"scenes/{scene}/report.html",
-            **_verdict(scene),
-            **_scores(scene),
-            **_since(scene, quality),
-        }
+        if found.state == "done":
+            row |= {"report": f"scenes/{scene}/report.html", **_verdict(scene), **_scores(scene)}
     except Exception as error:  # damaged files are for `snakemake verify` to name; the other rows are still wanted
-        reason = f"its files cannot be read ({type(error).__name__}: {error}); `snakemake verify` tells which are damaged"
-        return row | {"status": "failed", "stage": "publish", "reason": reason}
-
-
-def _is_published(scene: str, fingerprint: str) -> bool:
-    return _fingerprint_in(Path("scenes") / scene / "manifest.json") == fingerprint
-
-
-def _fingerprint_in(manifest: Path) -> str:
-    try:
-        return str(json.loads(read_record(manifest)).get("fingerprint", ""))
-    except (OSError, ValueError, AttributeError, RecursionError):
-        return ""
-
-
-def _why_not(scene: str, quality: str) -> Row:
-    """Return status, stage, reason and log of the first job that did not end well, or of the first missing one if none ran."""
-    missing = fp.missing_stages(scene, quality)
-    jobs = _jobs(scene, missing, quality)
-    stage = missing[0] if missing else "publish"
-    reason = f"stage {stage} has not run"
-    if not missing:
-        reason = f"all stages are finished, and scenes/{scene} is not there, or not what they made; the next run publishes it"
-    idle = {"status": "not run", "stage": stage, "reason": reason}
-    return jobs.get("failed") or jobs.get("running") or jobs.get("killed") or idle
-
-
-def _since(scene: str, quality: str) -> Row:
-    """Return reason and log of a job of a published scene that did not end well, as where damage was to be mended; empty if all
-    did."""
-    jobs = _jobs(scene, fp.NEEDED, quality)
-    job = jobs.get("failed") or jobs.get("killed")
-    if not job:
-        return {}
-    ended = "failed" if job["status"] == "failed" else "was killed"
-    return {"reason": f"it is published, but its last job of {job['stage']} {ended}: {job['reason']}", "log": job["log"]}
-
-
-def _jobs(scene: str, stages: Sequence[str], quality: str) -> dict[str, Row]:
-    """Return status, stage, reason and log of the first job in each of the states `failed`, `running` and `killed`."""
-    found: dict[str, Row] = {}
-    names = sorted(path.name for path in Path(f"results/{scene}/logs").glob("*.state.json"))
-    for stage, name in [(stage, name) for stage in stages for name in names if name.partition(".")[0] == stage]:
-        job = noted(state_file(scene, name.removesuffix(".state.json")), time.time())
-        if not job or not job.is_of(fp.fingerprint(stage, scene, quality)):
-            continue
-        state = "killed" if job.state == "running" and attempts.ended_for_slurm(job.document) else job.state
-        reason = "it runs" if state == "running" else attempts.killed(job.document)
-        if state == "failed":
-            reason = "; ".join([job.document.get("reason", ""), *job.document.get("earlier", [])])
-        log = f"results/{scene}/logs/{name.removesuffix('.state.json')}.log"
-        found.setdefault(state, {"status": state, "stage": stage, "reason": reason, "log": log})
-    return found
+        row |= {"status": "unknown", "stage": "publish", "reason": f"its files cannot be read ({type(error).__name__}: {error})"}
+    return row
 
 
 def _costs(scene: str) -> Row:
@@ -241,4 +192,4 @@ def _tsv(rows: Sequence[Row]) -> str:
 def _cell(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
-    return " | ".join(attempts.written_out(line.replace("\t", " ")) for line in str(value).splitlines())
+    return " | ".join(written_out(line.replace("\t", " ")) for line in str(value).splitlines())

@@ -12,13 +12,6 @@ from workflow import plugins
 from workflow.settings.prior import members, predictions
 
 MILLION = 1e6
-PASSES_OF_BASE = 10
-"""Passes over the pixels that the published descent of the base makes where no number of steps is set."""
-STEP_OF_BASE, STEP_OF_EMISSION = 65536, 8192
-"""Pixels of one step of the descents."""
-PUBLISHED_PATHS = 256 + 64 + 5 * 128
-"""Paths a pixel of `shading.method: published`: diffuse light, the mirror, and five lobes."""
-
 PROBED_VIEWS = 32
 """Photographs that stage plan reads."""
 
@@ -58,10 +51,12 @@ def work_of(stage: str, settings: dict[str, Any], size: SceneSize) -> Work:
         size: of the scene.
 
     Returns:
-        The kind, such as `direct`, and the counts. Every job has the count `job` of 1, for what it costs to start, and `a_view`,
-        the pixels of one photograph, which is what stages hold that work on one after the other.
+        The kind, such as `direct` or the module of a plug-in that takes the place of the stage, and the counts. Every job has
+        the count `job` of 1, for what it costs to start, and `a_view`, the pixels of one photograph, which is what stages hold
+        that work on one after the other.
     """
     kind, counts = (plugins.function("COSTS", stage) or _STAGES[stage])(settings, size)
+    kind = plugins.replacement(stage, settings) or kind  # which nobody has measured
     a_view = size.pixels / max(size.views, 1) / MILLION
     return Work(kind, {"job": 1.0, "a_view": a_view, **{name: float(value) for name, value in counts.items()}})
 
@@ -91,12 +86,7 @@ def _segmentation(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[
 def _base(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     base, pixels, faces = settings["base"], size.pixels / MILLION, size.faces / MILLION
     fused = pixels * min(base["predictions"] or 1 << 30, predictions(settings["prior"]))
-    counts = {"predictions": fused, "pixels": pixels, "faces": faces, "cells": _base_cells(settings, size)}
-    if base["solver"] == "direct":
-        return "direct", counts
-    hashed = (base["texture"] or ("hashgrid" if base["preset"] == "paper" else "cells")) == "hashgrid"
-    steps = base["iterations"] or (-(-PASSES_OF_BASE * size.pixels // STEP_OF_BASE) if base["preset"] == "paper" else 3000)
-    return ("hashgrid" if hashed else "descent"), {**counts, "steps": steps * STEP_OF_BASE / MILLION}
+    return "direct", {"predictions": fused, "pixels": pixels, "faces": faces, "cells": _base_cells(settings, size)}
 
 
 def _base_cells(settings: dict[str, Any], size: SceneSize) -> float:
@@ -115,20 +105,19 @@ def _common_scores(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict
 
 def _emission(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     emission, faces = settings["emission"], size.faces / MILLION
-    if emission["solver"].startswith("published"):
-        steps = emission["iterations"] or -(-size.pixels // STEP_OF_EMISSION)
-        paths = steps * STEP_OF_EMISSION * emission["samples"] / MILLION
-        return "published", {"paths": paths, "pixels": size.pixels / MILLION, "faces": faces}
     rows = min(emission["rows"], size.pixels) / MILLION
     seen = min(emission["pixels"], size.pixels) / MILLION
-    kind = "direct" if emission["solver"] == "direct" else "descent"
-    return kind, {"rows": rows, "paths": rows * emission["samples"], "pixels": seen, "views": size.views / 100, "faces": faces}
+    return "direct", {
+        "rows": rows,
+        "paths": rows * emission["samples"],
+        "pixels": seen,
+        "views": size.views / 100,
+        "faces": faces,
+    }
 
 
 def _shading(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     shading, pixels, faces = settings["shading"], size.pixels / MILLION, size.faces / MILLION
-    if shading["method"] == "published":
-        return "published", {"paths": pixels * PUBLISHED_PATHS, "pixels": pixels, "faces": faces}
     traced = pixels if shading["pixels"] == "all" else min(shading["pixels"] / MILLION, pixels)
     cells = 1 / shading["cell_edge"] ** 2 / MILLION  # a square metre
     noise = shading["noise"] if isinstance(shading["noise"], int | float) else 0.2
@@ -153,12 +142,8 @@ def _second_look(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[s
 def _affines(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     affines, pixels, faces = settings["affines"], size.pixels / MILLION, size.faces / MILLION
     read = pixels if affines["pixels"] == "all" else min(affines["pixels"] / MILLION, pixels)
-    if affines["model"] != "objects":
-        return affines["model"], {"pixels": pixels, "faces": faces}
-    counts = {"read": read, "pixels": pixels, "faces": faces, "cells": _base_cells(settings, size)}
-    if affines["solver"] == "direct":
-        return ("textured" if settings["prior"]["kind"] == "retinex" else "direct"), counts
-    return affines["solver"], {**counts, "passes": read * affines["epochs"]}
+    kind = "textured" if settings["prior"]["kind"] == "retinex" else "direct"
+    return kind, {"read": read, "pixels": pixels, "faces": faces, "cells": _base_cells(settings, size)}
 
 
 def _render(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:

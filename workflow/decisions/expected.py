@@ -7,9 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from iif_core.errors import InputError
 from workflow.decisions.record import Decision
-from workflow.runtime import forecast
 
 SHIPPED = Path(__file__).with_name("claims.json")
 """Made from the rows of the study `regret` (docs/method/plan.md#what-is-expected-of-a-component)."""
@@ -21,7 +19,8 @@ COLUMNS = ("cpu_seconds", "max_rss_mb", "disk_mb")
 
 
 class Whole(NamedTuple):
-    """What the stages of `STAGES` are expected to cost together: CPU seconds, peak memory and disk in MB."""
+    """What the stages of `STAGES` are expected to cost together (`workflow.runtime.forecast.together`): CPU seconds, peak memory
+    and disk in MB."""
 
     cpu_seconds: float
     memory_mb: float
@@ -34,20 +33,7 @@ def claims(path: Path = SHIPPED) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
-def whole(scene: str, quality: str) -> Whole | None:
-    """Return the expected cost of a scene; None where a stage is of a kind that was never measured."""
-    try:
-        costs = [forecast.job_cost(stage, scene, quality) for stage in STAGES]
-    except InputError:
-        return None
-    known = [(one.cpu_seconds, one.memory_mb, one.disk_mb) for one in costs]
-    if any(part is None for parts in known for part in parts):
-        return None
-    cpu, memory, disk = ([part.middle for part in parts] for parts in zip(*known, strict=True))  # type: ignore[union-attr]
-    return Whole(sum(cpu), max(memory), sum(disk))
-
-
-def with_expectation(item: Decision, whole: Whole | None, path: Path = SHIPPED) -> Decision:
+def with_expectation(item: Decision, whole: tuple[float, float, float] | None, path: Path = SHIPPED) -> Decision:
     """Return a decision with what is expected of having its component, `expected`, where it was measured in other rooms:
     `held_out_db` and `held_out_db_range` (gain on held-out photographs: median, smallest and largest), `rooms`, and
     `cpu_seconds`, `memory_mb`, `disk_mb` (what it adds to the scene)."""

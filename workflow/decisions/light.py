@@ -7,45 +7,13 @@ import numpy as np
 from iif_core.light.emission.search import STEP
 from iif_core.light.emission.sun import SHARP, SunEvidence
 from iif_core.light.emission.translucent import TRANSMITTANCE
-from workflow.decisions.plan import CACHE_COVERAGE, ESCAPE_BRIGHTNESS
+from workflow.decisions.plan import CACHE_COVERAGE
 from workflow.decisions.record import FORCED, SETTLED, Decision, decision
 
-ESCAPE_PRIMARY = 1e-3
-"""Share of camera rays that leave the mesh, above which an environment is considered."""
-ESCAPE_SECONDARY = 2e-3
-"""The same for rays from the surface."""
 ESCAPE_OPEN = 0.3
 """Share of escaping rays from which the mesh counts as a part of a room. Its holes then show the rest of the room, which is near
 and looks different from everywhere, so the environment has twelve directions instead of a map of what the cameras see
 (docs/method/light.md#open-meshes)."""
-
-
-def environment(setting: str, primary_escape: float, secondary_escape: float, relative_brightness: float | None) -> Decision:
-    """Decide about light from outside, needed if rays leave the mesh and do not meet black.
-
-    See docs/method/light.md#when-an-environment-is-included.
-
-    Args:
-        setting: `on`, `off` or `auto`.
-        primary_escape: share of camera rays without a hit.
-        secondary_escape: share of cosine-distributed rays from the surface that leave.
-        relative_brightness: mean radiance of escaping camera rays over the mean radiance of the photographs; None = none escaped.
-
-    Returns:
-        The decision.
-    """
-    measure = "share of cosine-distributed rays from the surface that leave the mesh"
-    if setting != "auto":
-        return decision("environment", setting == "on", measure, secondary_escape, ESCAPE_SECONDARY, f"set to {setting}", FORCED)
-    leaves = primary_escape > ESCAPE_PRIMARY or secondary_escape > ESCAPE_SECONDARY
-    dark = relative_brightness is not None and relative_brightness <= ESCAPE_BRIGHTNESS
-    if not leaves:
-        reason = f"the mesh is closed: {primary_escape:.2%} of camera rays and {secondary_escape:.2%} of others escape"
-    elif dark:
-        reason = f"rays escape into {relative_brightness:.1%} of the mean brightness: no light comes in from outside"
-    else:
-        reason = f"{primary_escape:.2%} of camera rays and {secondary_escape:.2%} of others escape"
-    return decision("environment", leaves and not dark, measure, secondary_escape, ESCAPE_SECONDARY, reason)
 
 
 _SUN = "share by which the misfit falls with a sun"

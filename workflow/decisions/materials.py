@@ -32,7 +32,7 @@ def given_words(objects: int, given: np.ndarray | None) -> list[str]:
 
 
 def given_by_hand(names: list[str], given: np.ndarray) -> Decision:
-    """Describe which materials were given by hand (`overrides`) and thus not fitted."""
+    """Describe which materials were given by hand (`materials`) and thus not fitted."""
     words = given_words(len(names), given)
     told = [f"{name} ({what})" for name, what in zip(names, words, strict=True) if what]
     reason = f"given by hand, not fitted: {'; '.join(told)}"

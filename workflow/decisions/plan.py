@@ -8,6 +8,10 @@ from typing import Any
 from iif_core.requirements.evidence import Evidence
 from workflow.decisions.record import FORCED, PROVISIONAL, SETTLED, Decision, by_evidence, decision, not_probed
 
+ESCAPE_PRIMARY = 1e-3
+"""Share of camera rays that leave the mesh, above which an environment is considered, where no evidence tells."""
+ESCAPE_SECONDARY = 2e-3
+"""The same for rays from the surface."""
 ESCAPE_BRIGHTNESS = 0.02
 """Brightness of escaping camera rays, relative to the photographs, up to which the outside counts as black."""
 CACHE_COVERAGE = 0.3
@@ -37,22 +41,36 @@ def _weighed(component: str, setting: str, evidence: Evidence, words: tuple[str,
 
 
 def environment(
-    setting: str, escape_primary: float, escape_secondary: float, brightness: float | None, evidence: Evidence
+    setting: str, escape_primary: float, escape_secondary: float, brightness: float | None, evidence: Evidence | None = None
 ) -> Decision:
-    """Decide about light from outside the mesh.
+    """Decide about light from outside, needed if rays leave the mesh and do not meet black.
+
+    See docs/method/light.md#when-an-environment-is-included.
 
     Args:
         setting: `on`, `off` or `auto`.
-        escape_primary, escape_secondary: share of camera rays and of rays from surface that leave the mesh.
-        brightness: of camera rays that leave it, relative to the photographs; None = none leaves.
-        evidence: for the radiance of rays that leave it.
+        escape_primary, escape_secondary: share of camera rays and of cosine-distributed rays from surface that leave the mesh.
+        brightness: mean radiance of camera rays that leave it, relative to the photographs; None = none leaves.
+        evidence: that photographs give for the radiance of rays that leave, as stage plan probes it. None = it did not tell, or
+            the mesh is another one now: then the shares decide, by their thresholds.
     """
     leaves = f"{escape_primary:.2%} of camera rays and {escape_secondary:.2%} of others leave the mesh"
+    dark = brightness is not None and brightness <= ESCAPE_BRIGHTNESS
+    # Seen, not inferred: a small lamp that the probe's rays miss may look like light from outside.
+    into = f"{leaves}, into {brightness:.1%} of the mean brightness" if dark else ""
+    if evidence is None:
+        if setting != "auto":
+            included, reason, status = setting == "on", f"forced {setting}", FORCED
+        elif not (escape_primary > ESCAPE_PRIMARY or escape_secondary > ESCAPE_SECONDARY):
+            included, reason, status = False, f"the mesh is closed: {leaves}", SETTLED
+        else:
+            included, reason, status = not dark, into or leaves, SETTLED
+        measure = "share of cosine-distributed rays from the surface that leave the mesh"
+        return decision("environment", included, measure, escape_secondary, ESCAPE_SECONDARY, reason, status)
     if setting == "auto" and not (escape_primary or escape_secondary):
         return not_probed("environment", False, f"the mesh is closed: {leaves}", SETTLED)
-    if setting == "auto" and brightness is not None and brightness <= ESCAPE_BRIGHTNESS:
-        # Seen, not inferred: a small lamp that the probe's rays miss may look like light from outside.
-        return by_evidence("environment", False, evidence, f"{leaves}, into {brightness:.1%} of the mean brightness", SETTLED)
+    if setting == "auto" and dark:
+        return by_evidence("environment", False, evidence, into, SETTLED)
     words = (f"{leaves}, and bring light", f"{leaves}, and bring no light", f"{leaves}; the photographs do not tell yet")
     return _weighed("environment", setting, evidence, words, "emission")
 
@@ -121,22 +139,15 @@ def matte_by_predictions(provisional: Decision, lowest_roughness: float, metal: 
     return {**provisional, **settled}
 
 
-def not_planned() -> list[Decision]:
-    """Return the components of the published method, which decides about them itself."""
-    names = ("environment", "emitters", "radiance_cache", "metallic", "affine_size", "denoiser")
-    out = [not_probed(name, True, "the published method is not planned", PROVISIONAL) for name in names]
-    return [*out, not_probed("specular", True, "the published method traces all lobes", SETTLED)]
-
-
 OVERRIDDEN = ("environment", "specular", "metallic", "radiance_cache", "denoiser")
-"""Components that the settings can force (`override: {components: ...}`)."""
+"""Components that the settings can force (`components: {...}`)."""
 
 
 def with_override(item: Decision) -> Decision:
     """Return a decision with the words that turn it over in the scene file, where there are any."""
     if item["component"] not in OVERRIDDEN or (item["component"] == "metallic" and not item["included"]):
         return item
-    return {**item, "override": f"override: {{components: {{{item['component']}: {'off' if item['included'] else 'on'}}}}}"}
+    return {**item, "override": f"components: {{{item['component']}: {'off' if item['included'] else 'on'}}}"}
 
 
 def included(plan: list[dict[str, Any]], component: str) -> Decision:

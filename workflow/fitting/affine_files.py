@@ -18,15 +18,15 @@ from workflow.scene.base_scene import base_maps, read_base
 from workflow.scene.normal_form import CaptureReader
 
 
-def write_facts(job: Job, fit: FitResult, loss: dict[str, float], plan: list[Decision]) -> None:
-    """Write affines.json."""
+def write_facts(job: Job, solver: str, fit: FitResult, plan: list[Decision]) -> None:
+    """Write affines.json; `solver`: the name of what fitted."""
     spread = np.sqrt(np.clip(np.diagonal(fit.response_covariance), 0.0, None))
     weight = np.maximum(fit.pixels, 1e-9)
     facts = dict(fit.facts)
     job.writer.json(
         "affines.json",
         {
-            "solver": job.settings.affines.solver,
+            "solver": solver,
             "light_scale": float(fit.light_scale),
             "numerics": numerics.of_affines(facts.pop("numerics", {}), bool(fit.converged)),
             **facts,
@@ -34,7 +34,6 @@ def write_facts(job: Job, fit: FitResult, loss: dict[str, float], plan: list[Dec
             "converged": bool(fit.converged),
             "iterations": int(fit.iterations),
             "stopped": fit.reason,
-            "reference_loss": loss,
             "pixels": int(fit.pixels.sum()),
             "residual": float(np.sqrt(np.average(fit.residual**2, weights=weight))) if len(fit.pixels) else 0.0,
             "response": {**response_facts(fit.response), "std": spread.tolist(), "covariance": fit.response_covariance.tolist()},

@@ -89,19 +89,19 @@ def _lamp_gauge(job: Job, lamp: KnownLamp) -> Callable[[FitProblem, Places], Gau
 
 
 def given_materials(job: Job, names: list[str]) -> np.ndarray | None:
-    """Return roughness and metallic (O, 2) that `overrides` gives, NaN = fitted; None if it gives nothing.
+    """Return roughness and metallic (O, 2) that `materials` gives, NaN = fitted; None if it gives nothing.
 
     Raises:
         InputError: no object has this name or id, two entries mean the same object, or the model has no specular lobes.
     """
-    wanted: dict[str, Any] = vars(job.settings.overrides)
+    wanted: dict[str, Any] = vars(job.settings.materials)
     if not wanted:
         return None
-    where = f"{scene_origin(job.scene)}: `overrides`"
+    where = f"{scene_origin(job.scene)}: `materials`"
     if not has_lobes(job):
         raise InputError(
             f"{where}: found materials given by hand, but this scene is fitted without specular lobes, so they would change"
-            " nothing; set `override: {components: {specular: on}}`, or remove them"
+            " nothing; set `components: {specular: on}`, or remove them"
         )
     given = np.full((len(names), 2), np.nan)
     for key, entry in wanted.items():

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iif_core.fitting.baselines.texture import AlbedoSums
+from iif_core.fitting.cell_pixels import AlbedoSums
 from iif_core.fitting.cell_texture import smooth_light, textured_albedo
 from iif_core.fitting.problem import FitResult
 from iif_core.light.base_scene import BaseScene
 from iif_core.reflectance.material import apply_affines
 from iif_core.surface.cells import neighbour_pairs, pack_keys
-from workflow.fitting.baselines import CellPixels
+from workflow.fitting.cell_pixels import CellPixels
 from workflow.fitting.inputs import roughness_levels
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader

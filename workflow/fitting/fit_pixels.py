@@ -46,12 +46,6 @@ class FitPixels:
         """Draw about `budget` pixels, given the number of eligible ones of each object, (O,)."""
         return cls(mixed, counts < THIN_PIXELS, fair_shares(counts, budget), seed)
 
-    @classmethod
-    def every(cls, n_objects: int, mixed: np.ndarray) -> FitPixels:
-        """Take all pixels of the objects, those along their borders too."""
-        count = max(n_objects, 1)
-        return cls(mixed, np.ones(count, bool), np.ones(count), 0)
-
     def of(self, pixels: ViewPixels, view: View) -> np.ndarray:
         """Return the places (k,), increasing, of the drawn ones among the pixels of a view."""
         inside = pixels.interior | self.thin[np.maximum(pixels.object_id, 0)]

@@ -96,7 +96,7 @@ def commands(scene: str, quality: str, overrides: Sequence[tuple[str, str]], nam
         )
     ]
     out += [Command(f"make it again at quality {other}", f"{made} --config quality={other}") for other in others]
-    out.append(Command("or in a time that you give, in seconds", f"{made} --config budget=600"))
+    out.append(Command("or in a time that you give, in seconds", f"{made} --config quality=600s"))
     if overrides:
         component, words = overrides[0]
         out.append(Command(f"decide about {component} yourself: add this to the scene file, then", f"{words}\n{made}{same}"))

@@ -386,7 +386,7 @@ def _materials(e: Evidence) -> Light:
 
 def _gloss(e: Evidence) -> list[Finding | None]:
     """Judge roughness and metallic: by the truth, or else by what the fit claims, which is too little by experience."""
-    remedy = "Compare 'roughness' of result and truth; what you know, set under `overrides` in the scene file"
+    remedy = "Compare 'roughness' of result and truth; what you know, set under `materials` in the scene file"
     if e.has_truth:
         return [
             _finding(
@@ -397,7 +397,7 @@ def _gloss(e: Evidence) -> list[Finding | None]:
                 remedy.replace("roughness", "metallic"), ".1f",
             ),
         ]  # fmt: skip
-    remedy = "Photograph what shines from more directions; what you know, set under `overrides` in the scene file"
+    remedy = "Photograph what shines from more directions; what you know, set under `materials` in the scene file"
     if e.roughness_interval is None:
         return [Finding(AMBER, "Roughness was measured on less than 50 % of the surface seen; elsewhere it is a guess", remedy)]
     return [

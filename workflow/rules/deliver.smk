@@ -4,24 +4,7 @@
 rule publish:
     """Copy the deliverable to scenes/<scene>/."""
     input:
-        unpack(
-            publish_inputs(
-                "capture",
-                "plan",
-                "prior",
-                "segmentation",
-                "base",
-                "emission",
-                "shading",
-                "second_look",
-                "affines",
-                "render",
-                "metrics",
-                "export",
-                "report",
-                "room",
-            )
-        ),
+        unpack(publish_inputs),
     output:
         scene=report(
             directory("scenes/{scene}"),
@@ -52,7 +35,7 @@ rule planned:
         "results/{scene}/logs/planned.log",
     localrule: True
     params:
-        quality=lambda wildcards: quality_of(wildcards.scene),
+        quality=quality,
     message:
         "{wildcards.scene}: what it requires, in plan/{wildcards.scene}/plan.yaml"
     shell:
@@ -75,7 +58,7 @@ rule relit:
         "results/{scene}/logs/relit.log",
     localrule: True
     params:
-        quality=lambda wildcards: quality_of(wildcards.scene),
+        quality=quality,
     message:
         "{wildcards.scene}: pictures in relight/{wildcards.scene}"
     shell:
@@ -98,7 +81,7 @@ rule relit_plan:
         "results/{scene}/logs/relit-{plan}.log",
     localrule: True
     params:
-        quality=lambda wildcards: quality_of(wildcards.scene),
+        quality=quality,
     message:
         "{wildcards.scene}: pictures in relight/{wildcards.scene}/{wildcards.plan}"
     shell:
@@ -106,7 +89,7 @@ rule relit_plan:
 
 
 rule bench:
-    """Run three points of the measured front in this room: what they take on this machine, and what they score."""
+    """Run three measured qualities in this room: what they take on this machine, and what they score."""
     input:
         bench_inputs,
     output:
@@ -117,7 +100,7 @@ rule bench:
     params:
         mark=lambda wildcards: or_stop(bench.marks, wildcards.scene),
     message:
-        "{wildcards.scene}: three points of speed and accuracy, in bench/{wildcards.scene}/bench.md"
+        "{wildcards.scene}: three qualities, in bench/{wildcards.scene}/bench.md"
     shell:
         "python3 -m workflow bench {wildcards.scene} --log {log:q}"
 
@@ -143,7 +126,7 @@ rule compare:
 rule score:
     """Score anyone's maps against a scene with truth: --config maps=<folder>."""
     input:
-        unpack(scored_inputs("capture", "segmentation")),
+        unpack(scored_inputs),
     output:
         page=directory("score/{scene}"),
     log:

@@ -37,7 +37,7 @@ CAUSES = {
 
 def of_the_machine(error: OSError) -> str:
     """Return a sentence on an error of the operating system: the file, what is wrong, and what to do."""
-    from workflow.runtime.attempts import written_out
+    from workflow.runtime.job_state import written_out
 
     name = error.filename2 or error.filename  # of a renaming, what was to be replaced: the other is a name of ours
     place = f"{name}: " if name else ""

@@ -23,11 +23,9 @@ BESIDE_MB = 150
 TIME_MARGIN, TIME_LEAST = 4.0, 10
 """A scheduler ends a job that takes longer than it said, so this is generous, and minutes."""
 UNKNOWN_MEMORY, UNKNOWN_MINUTES, UNKNOWN_DISK = 12_000, 720, 20_000
-"""Of kinds of jobs that nobody has measured yet: priors that are networks, and segmentation by masks of a network."""
+"""Of kinds of jobs that nobody has measured yet: networks as priors or for masks, stages of plug-ins."""
 START, START_OF_JOB = 5.0, 0.9
 """Wall seconds that Snakemake takes to start, and that the start of a job adds to what the job measures itself."""
-ONE_THREAD = ("export", "report", "publish")
-"""Stages whose rules take one thread; the others take two."""
 COMPILATION = {"base": 15.0, "affines": 15.0}
 """CPU seconds that the first job of a stage takes longer in a checkout whose kernels were never compiled."""
 COMPILED = "iif_core/{}/__pycache__/kernels.*.nbi"
@@ -65,6 +63,17 @@ def job_cost(stage: str, scene: str, quality: str, threads: int = 2, machine: fl
     """Return what a job will cost on this machine, or on one of factor `machine`."""
     factor = machine_factor() if machine is None else machine
     return predict(stage, job_work(stage, scene, quality), threads, factor)
+
+
+def together(stages: Iterable[str], scene: str, quality: str) -> tuple[float, float, float] | None:
+    """Return what stages are expected to cost together: CPU seconds, peak memory and disk in MB; None where one is of a kind that
+    was never measured, or the settings or files of the scene cannot be used."""
+    try:
+        costs = [job_cost(stage, scene, quality) for stage in stages]
+        cpu, memory, disk = ([cost[i].middle for cost in costs] for i in (0, 2, 3))  # type: ignore[union-attr]
+    except (InputError, AttributeError):
+        return None
+    return sum(cpu), max(memory), sum(disk)
 
 
 def memory_mb(cost: Cost, on_node: bool = False) -> int:
@@ -113,7 +122,7 @@ def wall(scene: str, quality: str, cores: int) -> Wall:
     for stage in STAGES.values():
         if stage.on_demand or (stage.name == "capture" and rendered):
             continue
-        threads = min(1 if stage.name in ONE_THREAD else 2, cores)
+        threads = min(stage.threads, cores)
         cost = job_cost(stage.name, scene, quality, threads)
         if cost.seconds is None:
             kind = job_work(stage.name, scene, quality).kind

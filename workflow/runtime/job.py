@@ -11,7 +11,7 @@ import re
 import resource
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +23,7 @@ from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter, links, stamps
 from workflow.artifacts.files import read_record, write_json
 from workflow.registry import SHARED, STAGES
-from workflow.runtime import device, events, forecast
+from workflow.runtime import device, forecast
 from workflow.runtime import fingerprint as fp
 from workflow.settings import study_files
 
@@ -64,7 +64,7 @@ class Job:
         self._progress_of, self._first_item = "", (0, self._started)
         self._cpu_started = time.process_time()
         self._parts: dict[str, dict[str, float]] = {}
-        self._earlier = {"seconds": 0.0, "cpu_seconds": 0.0}  # of killed runs that this one continues
+        self._earlier = {"seconds": 0.0, "cpu_seconds": 0.0}  # of jobs that made parts of this stage
         self._readers: dict[tuple[str, str], StageReader] = {}
 
     @cached_property
@@ -167,20 +167,6 @@ class Job:
             part["seconds"] += time.perf_counter() - wall
             part["cpu_seconds"] += time.process_time() - cpu
 
-    def keep_state(self, name: str, arrays: Mapping[str, Any], facts: Any) -> None:
-        """Write down where a long computation is (`StageWriter.keep_state`), and what it took so far."""
-        spent = {"seconds": time.monotonic() - self._started, "cpu_seconds": time.process_time() - self._cpu_started}
-        spent = {key: value + self._earlier[key] for key, value in spent.items()}
-        self.writer.keep_state(name, arrays, {"spent": spent, "facts": facts})
-
-    def kept_state(self, name: str) -> tuple[dict[str, Any], Any] | None:
-        """Return arrays and facts of an earlier run of this job that was killed, or None; its seconds are added to this job's."""
-        kept = self.writer.kept_state(name)
-        if kept is None:
-            return None
-        self._earlier = kept[1]["spent"]
-        return kept[0], kept[1]["facts"]
-
     def write_timings(self, part: str = "") -> None:
         """Write what `timed` recorded, and as `job` the seconds, CPU seconds, peak memory (MB) and threads of the whole job.
 
@@ -232,9 +218,6 @@ class Job:
         since = (now - then) / (done - done_first) if done > done_first else 0.0
         left = f", about {since * (total - done):.0f} s left" if since and done < total else ""
         self.log.info("%s: %d of %d (%.0f s%s)", what, done, total, spent, left)
-        if events.due():
-            facts = {"what": what, "done": done, "total": total, "seconds": round(spent, 3)}
-            events.tell("progress", self.scene, self.name, self.fingerprint, **facts)
 
 
 def library_versions() -> dict[str, str]:

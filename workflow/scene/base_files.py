@@ -13,15 +13,6 @@ from workflow.runtime.job import Job
 from workflow.scene.decoded import DecodedViews
 from workflow.scene.fusion_input import on_surface
 from workflow.scene.normal_form import View
-from workflow.scene.predictions import Predictions
-
-
-def raw_maps(prior: Predictions, view: View, surface: np.ndarray) -> dict[str, np.ndarray]:
-    """Channels of the first usable prediction of a view, unchanged, where there is surface."""
-    maps = prior.maps(view, prior.samples)
-    good = np.isfinite(maps).mean((1, 2, 3)) > 0.99
-    first = np.where(surface[..., None], maps[int(np.argmax(good))], 0).astype(np.float32)
-    return {**split_rgb(first[..., :3], "albedo"), "roughness": first[..., 3], "metallic": first[..., 4]}
 
 
 def write_cells(job: Job, grid: CellGrid, n_objects: int, result: FusionResult) -> None:

@@ -35,20 +35,20 @@ def object_number(key: object, names: list[str], where: str) -> int:
 
 @lru_cache(None)
 def check_overrides(stage: str, scene: str, quality: str) -> None:
-    """Check the objects that `overrides` names, once the segmentation is known. Every later stage checks them before its work,
+    """Check the objects that `materials` names, once the segmentation is known. Every later stage checks them before its work,
     not only stage `affines`, which is the first to use them.
 
     Raises:
         InputError: as `object_number`.
     """
-    wanted = json.loads(fp.resolved(scene, quality))["overrides"]
+    wanted = json.loads(fp.resolved(scene, quality))["materials"]
     if not wanted or "segmentation" not in upstream_of(stage):
         return
     reader = finished("segmentation", scene, quality)
     if reader is not None:
         names = object_names(reader)
         for key in wanted:
-            object_number(key, names, f"{scene_origin(scene)}: `overrides`")
+            object_number(key, names, f"{scene_origin(scene)}: `materials`")
 
 
 def object_names(segmentation: StageReader, n_objects: int | None = None) -> list[str]:

@@ -2,8 +2,7 @@
 
 Order of precedence: defaults in this package < `config/quality/<quality>.yaml` < `config/scenes/<scene>.yaml`; for a variant of a
 study (study_files.py) also < `config/studies/scenes.yaml` < `config/studies/<study>.yaml`; for a line of `config/batch.tsv`
-(batch_table.py) its base takes the place of the file of the scene, under the columns of the line. The file of a `preset`,
-`config/presets/<preset>.yaml`, lies right below the uppermost layer that names one. `names.configuration` says when
+(batch_table.py) its base takes the place of the file of the scene, under the columns of the line. `names.configuration` says when
 these files are those of the working folder and when those of the repository. Nothing else is consulted: no environment variables,
 no hidden files.
 """
@@ -15,7 +14,7 @@ from workflow.settings.relight import relight_files, require_relighting
 from workflow.settings.relight_plans import active_plan, plan_names
 from workflow.settings.scene import UNIONS, SceneSettings, dump, recorded, select
 from workflow.settings.section import Section
-from workflow.settings.targets import refuse_profile, refuse_scatter, refuse_target
+from workflow.settings.targets import refuse_target
 from workflow.settings.yaml_file import read_yaml
 
 __all__ = [
@@ -33,8 +32,6 @@ __all__ = [
     "recorded",
     "plan_schema_json",
     "reference_markdown",
-    "refuse_profile",
-    "refuse_scatter",
     "refuse_target",
     "relight_files",
     "relight_origin",

@@ -23,8 +23,8 @@ from workflow.settings.names import RESERVED, SCENE_NAME, configuration, did_you
 from workflow.settings.yaml_file import parse_yaml, read_yaml
 
 TABLE = Path("config/batch.tsv")
-CHOSEN = ("config/quality/", "config/presets/")
-"""Files of settings that a user names and does not write."""
+QUALITY = "config/quality/"
+"""Where files of settings lie that a user names and does not write."""
 COLUMNS = ("name", "source", "path", "base", "overrides")
 _NAME = re.compile(SCENE_NAME)
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*")
@@ -228,7 +228,7 @@ def layers(line: Line, root: Path = Path(".")) -> list[tuple[str, dict[str, Any]
 
 def blame(line: Line, among: list[tuple[str, dict[str, Any]]]) -> Callable[[str], str]:
     """Return a function that tells where the value of a dotted key comes from: the layer that names most of it, the upper one
-    of two. A quality or a preset is named only for keys that it sets itself: what is missing is missing in the table."""
+    of two. A quality is named only for keys that it sets itself: what is missing is missing in the table."""
 
     def where(dotted: str) -> str:
         best, found = line.at(), 0
@@ -239,7 +239,7 @@ def blame(line: Line, among: list[tuple[str, dict[str, Any]]]) -> Callable[[str]
                     break
                 depth, node = depth + 1, node[part]
             whole = depth == dotted.count(".") + 1
-            if depth and depth >= found and (whole or not name.startswith(CHOSEN)):
+            if depth and depth >= found and (whole or not name.startswith(QUALITY)):
                 best, found = name, depth
         missing = dotted == "source.path" and found < 2
         return line.at("path") if missing else best

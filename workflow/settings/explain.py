@@ -32,11 +32,12 @@ BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 """Words for the limits of a number, by their names in pydantic's errors."""
 EXAMPLES = {"relight": "config/relight/kitchen.yaml"}
 """Files that show all of a section that config/scenes/kitchen.yaml does not have."""
-TWINS = {
-    "override": " Did you mean `overrides`, where materials of objects are given?",
-    "overrides": " Did you mean `override`, where parts of the model are forced in or out?",
+RENAMED = {
+    "point": "quality",
+    "override": "components",
+    "overrides": "materials",
 }
-"""Sections whose names are alike: what is said about a key that they do not know."""
+"""Keys of earlier versions -> their names now."""
 
 
 def _section_of(where: tuple[str | int, ...]) -> type[Section] | None:
@@ -137,7 +138,8 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
         if kind == "extra_forbidden":
             section = _section_of(where)
             allowed = sorted(section.model_fields) if section else []
-            hint = NOT_READ.get(dotted) or did_you_mean(where[-1], allowed, "`{}`") or TWINS.get(str(where[0]), "")
+            hint = NOT_READ.get(dotted) or did_you_mean(where[-1], allowed, "`{}`")
+            hint = f" It is `{RENAMED[dotted]}` now." if dotted in RENAMED else hint
             lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
         elif kind in ("model_type", "model_attributes_type", "dict_type"):
             lines.append(

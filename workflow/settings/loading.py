@@ -14,7 +14,6 @@ from workflow.settings import batch_table, relight_plans, study_files
 from workflow.settings.explain import explain
 from workflow.settings.names import (
     DEFAULT,
-    PRESETS,
     QUALITIES,
     RESERVED,
     SCENE_NAME,
@@ -24,7 +23,7 @@ from workflow.settings.names import (
     scene_names,
     scene_path,
 )
-from workflow.settings.scene import SECTIONS_THAT_CHOOSE, SceneSettings
+from workflow.settings.scene import SceneSettings
 from workflow.settings.source import Capture
 from workflow.settings.yaml_file import read_yaml
 
@@ -101,14 +100,14 @@ def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSet
         InputError: names the file, the key, what was found and what is allowed.
     """
     below, above, line = _layers(scene, quality, root)
-    layers = _with_preset([*below, *above], root)
+    layers = [*below, *above]
     try:
         return SceneSettings.model_validate(_merged(layers))
     except ValidationError as error:
         if line:
             raise InputError(explain(error, batch_table.blame(line, layers))) from None
-        for count, (place, _) in enumerate(layers, 1):  # blame the first file that spoils it, but who names a preset for that
-            if not place or place.startswith(batch_table.CHOSEN):
+        for count, (place, _) in enumerate(layers, 1):  # blame the first file that spoils it
+            if not place or place.startswith(batch_table.QUALITY):
                 continue
             try:
                 SceneSettings.model_validate(_merged(layers[:count]))
@@ -152,31 +151,31 @@ def _layers(scene: str, quality: str, root: Path) -> tuple[Layers, Layers, batch
 
 
 def _blamed(place: str, layers: Layers, dotted: str) -> str:
-    """Return which of some layers sets a key: the one at `place`, or else a quality or preset below it."""
+    """Return which of some layers sets a key: the one at `place`, or else a quality below it."""
     for name, layer in reversed(layers):
         node: Any = layer
         for part in dotted.split("."):
             node = node.get(part) if isinstance(node, dict) else None
         if node is not None:
-            return name if name.startswith(batch_table.CHOSEN) else place
+            return name if name.startswith(batch_table.QUALITY) else place
     return place
 
 
 def _quality(quality: str, root: Path) -> dict[str, Any]:
-    """Return the settings of a quality; where its file names a `point`, those of the point with its own over them."""
+    """Return the settings of a quality; where its file names another `quality`, those of that one with its own over them."""
     names = quality_names(root)
     if quality not in names:
         hint = did_you_mean(quality, names)
         raise InputError(f"--config quality={quality}: unknown quality.{hint} Allowed: {', '.join(names)}")
     settings = read_yaml(configuration(f"quality/{quality}.yaml", root))
-    if "point" not in settings:
+    if "quality" not in settings:
         return settings
-    point, own = settings["point"], {key: value for key, value in settings.items() if key != "point"}
-    below = read_yaml(configuration(f"quality/{point}.yaml", root)) if point in names else {"point": None}
-    if "point" in below:
+    other, own = settings["quality"], {key: value for key, value in settings.items() if key != "quality"}
+    below = read_yaml(configuration(f"quality/{other}.yaml", root)) if other in names else {"quality": None}
+    if "quality" in below:
         raise InputError(
-            f"config/quality/{quality}.yaml: `point`: found {point!r}; needed is the name of a file next to it that has no"
-            " `point` itself, such as p01"
+            f"config/quality/{quality}.yaml: `quality`: found {other!r}; needed is the name of a file next to it that names no"
+            " `quality` itself, such as p01"
         )
     return merge(below, own)
 
@@ -239,26 +238,13 @@ def photographs(quality: str, root: Path = Path(".")) -> str:
 def canonical(quality: str, root: Path = Path(".")) -> str:
     """Return the name under which a quality is run: a point that is all of a named quality has that name."""
     for name in QUALITIES:
-        if read_yaml(configuration(f"quality/{name}.yaml", root)) == {"point": quality}:
+        if read_yaml(configuration(f"quality/{name}.yaml", root)) == {"quality": quality}:
             return name
     return quality
-
-
-def _with_preset(layers: list[tuple[str, dict[str, Any]]], root: Path) -> list[tuple[str, dict[str, Any]]]:
-    """Return the layers with the file of the `preset` that the uppermost of them names, right below that layer."""
-    naming = [i for i, (_, layer) in enumerate(layers) if "preset" in layer]
-    name = layers[naming[-1]][1]["preset"] if naming else None
-    if name not in PRESETS:
-        return layers
-    file = configuration(f"presets/{name}.yaml", root)
-    return [*layers[: naming[-1]], (f"config/presets/{name}.yaml", read_yaml(file)), *layers[naming[-1] :]]
 
 
 def _merged(layers: list[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for _, layer in layers:
-        for name, section in SECTIONS_THAT_CHOOSE.items():
-            if isinstance(out.get(name), dict) and isinstance(layer.get(name), dict):
-                out[name] = section.without_idle(out[name], layer[name])
         out = merge(out, layer)
     return out

@@ -14,8 +14,6 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 QUALITIES = ("draft", "standard", "paper")
 DEFAULT = "draft"
 """Quality of what is given none."""
-PRESETS = ("published", "published_repaired")
-"""Methods other than ours that have a file in config/presets/."""
 SCENE_NAME = r"[A-Za-z0-9][A-Za-z0-9_-]*"
 """What a scene may be called: its name is a folder, a target of Snakemake and part of the names of variants."""
 LONG = 200

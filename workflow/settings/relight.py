@@ -12,9 +12,9 @@ from pydantic import AfterValidator, AliasChoices, BeforeValidator, Field, field
 from iif_core.errors import InputError
 from workflow.intake import limits
 from workflow.intake.pictures import exr_size
+from workflow.settings.by_hand import TEXT_KEYS
 from workflow.settings.mesh_files import MESHES, files_of_mesh
 from workflow.settings.names import did_you_mean_path
-from workflow.settings.override import TEXT_KEYS
 from workflow.settings.section import Section
 
 Light = Annotated[float, Field(ge=0, le=limits.RADIANCE)]

@@ -9,10 +9,9 @@ from pydantic import Field, field_validator, model_validator
 
 from workflow import plugins
 from workflow.settings import affines, base, light, outputs
-from workflow.settings.affines import FREE_CELLS, textures_cells
-from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES, PUBLISHED
+from workflow.settings.by_hand import ByObject, Components
+from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES
 from workflow.settings.limits import Limits
-from workflow.settings.override import ByObject, Override
 from workflow.settings.prior import LearnedPrior, Member, Prior, predictions
 from workflow.settings.relight import Relightings, lamp_bases, recombines
 from workflow.settings.section import Section
@@ -43,9 +42,6 @@ Render, Metrics, Export, Report, Room = (EXTENDED[name] for name in ("render", "
 class SceneSettings(Section):
     """All settings of one scene."""
 
-    preset: Literal["ours", "published", "published_repaired"] = "ours"
-    """`published`: every stage as the paper has it, to compare with; `published_repaired`: the same without its errors
-    (lab/docs/published.md). Presets are files of settings, config/presets/, right below the file that names them."""
     source: Source
     """Where photographs, cameras and mesh come from."""
     capture: Capture = Capture()
@@ -66,9 +62,9 @@ class SceneSettings(Section):
     export: Export = Export()
     report: Report = Report()
     room: Room = Room()
-    override: Override = Override()
+    components: Components = Components()
     """Parts of the model that are forced in or out, in the words of plan.yaml."""
-    overrides: ByObject = Field(default_factory=dict)
+    materials: ByObject = Field(default_factory=dict)
     """Corrections by hand: name or id of an object -> its `roughness`, `metallic` or both, which are then not fitted
     (docs/guide/relighting.md#corrections-by-hand)."""
     relight_title: str = ""
@@ -103,33 +99,10 @@ class SceneSettings(Section):
         return self
 
     @model_validator(mode="after")
-    def _published_photographs(self) -> SceneSettings:
-        if self.emission.solver in PUBLISHED and not isinstance(self.affines.response, str):
-            raise ValueError(
-                f"`emission: solver: {self.emission.solver}` takes a family as `affines: response`, and no measured curve; name"
-                " one, or set another solver"
-            )
-        if self.emission.solver in PUBLISHED and self.capture.dynamic_range == "hdr":
-            raise ValueError(
-                f"`emission: solver: {self.emission.solver}` knows the loss of 8-bit photographs alone; set"
-                " `capture: {dynamic_range: ldr}`, or another solver"
-            )
-        return self
-
-    @model_validator(mode="after")
     def _overridden(self) -> SceneSettings:
         """Put components that are forced, and have a setting of their own, in the place of that setting."""
-        choice = self.override.components
+        choice = self.components
         forced = {name: value for name, value in choice.model_dump().items() if value != "auto"}
-        published = self.emission.solver in PUBLISHED or self.shading.method == "published"
-        if forced and (self.preset != "ours" or published):
-            raise ValueError(f"`override: components: {', '.join(forced)}`: the published method has no plan; remove it")
-        fits_both = self.affines.model == "objects" and self.affines.solver == "direct"
-        for component in ("specular", "metallic"):
-            if forced.get(component) == "off" and not fits_both:
-                raise ValueError(f"`override: components: {component}: off`: needs `affines: {{model: objects, solver: direct}}`")
-        if self.overrides and not (fits_both and self.preset == "ours"):
-            raise ValueError("`overrides`: materials given by hand need `affines: {model: objects, solver: direct}`; remove them")
         own = {
             "environment": ("emission", "environment", {"on": "on", "off": "off"}),
             "radiance_cache": ("shading", "indirect", {"on": "cache", "off": "path"}),
@@ -140,7 +113,7 @@ class SceneSettings(Section):
                 part, value = getattr(self, section), values[forced[component]]
                 if key in part.model_fields_set and getattr(part, key) not in (value, "auto"):
                     raise ValueError(
-                        f"`override: components: {component}: {forced[component]}` contradicts"
+                        f"`components: {component}: {forced[component]}` contradicts"
                         f" `{section}: {key}: {getattr(part, key)}`; remove one of the two"
                     )
                 object.__setattr__(self, section, part.model_copy(update={key: value}))
@@ -150,18 +123,20 @@ class SceneSettings(Section):
     def _automatic_shading(self) -> SceneSettings:
         """Replace `shading: {pixels: auto}` by the number or `all`, and `noise: auto` by the number: what is traced follows from
         what is read."""
-        textured = self.affines.model == "objects" and textures_cells(self.affines.texture, self.prior.kind)
-        every = textured or self.affines.model in FREE_CELLS or self.affines.pixels == "all"
+        cells = self.affines.of_cells(self.prior.kind)
+        every = bool(cells) or self.affines.pixels == "all"
         asked, needed = self.shading.pixels, "all" if every else self.affines.pixels
         if asked == "auto":
             object.__setattr__(self, "shading", self.shading.model_copy(update={"pixels": needed}))
         elif asked != "all" and (every or asked < self.affines.pixels):
-            whole = "pixels: all" if self.affines.pixels == "all" else f"model: {self.affines.model}"
-            reader = "texture from the photographs" if textured else f"`affines: {whole}`"
-            why = f"{reader} reads every pixel" if every else f"the fit reads {needed} (`affines: pixels`)"
+            why = (
+                f"{cells or '`affines: pixels: all`'} reads every pixel"
+                if every
+                else f"the fit reads {needed} (`affines: pixels`)"
+            )
             raise ValueError(f"`shading: pixels` is {asked}, but {why}; write `auto`, or at least `{needed}`")
         if self.shading.noise == "auto":
-            noise = NOISE_OF_TEXTURES if textured or self.affines.model in FREE_CELLS else NOISE_OF_OBJECTS
+            noise = NOISE_OF_TEXTURES if cells else NOISE_OF_OBJECTS
             object.__setattr__(self, "shading", self.shading.model_copy(update={"noise": noise}))
         return self
 
@@ -179,13 +154,6 @@ UNIONS = {"source": _members(Source), "prior": _members(Prior), "segmentation": 
 """Sections whose `kind` decides which other keys they have: section -> kind -> model."""
 POOLED = _members(Member)
 """The same of the members of `prior: {kind: pooled}`."""
-
-SECTIONS_THAT_CHOOSE: dict[str, type[Section]] = {
-    name: field.annotation
-    for name, field in SceneSettings.model_fields.items()
-    if isinstance(field.annotation, type) and issubclass(field.annotation, Section) and field.annotation.IDLE
-}
-"""Sections with a setting, such as `solver`, that leaves others of the same section without effect."""
 
 
 def section_in(annotation: Any) -> Any:

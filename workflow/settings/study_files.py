@@ -1,8 +1,10 @@
-"""Studies: tables of variants (settings) x scenes x seeds, run by the ordinary rules (lab/docs/studies.md).
+"""Derived scenes: variants (settings) x seeds of a scene, run by the ordinary rules. Studies of the laboratory are made of them
+(lab/docs/studies.md), and so are benches and plans of relightings.
 
 A *derived scene* `<scene>--<study>-<variant>-s<seed>` has the settings of the scene's own file, over them its entry in
 `config/studies/scenes.yaml`, over these `common` of the study and the settings of the variant, and `prior.seed: <seed>`.
 `<scene>--s<seed>` is the same without study and variant and holds what all studies share: photographs, predictions, segments.
+Of the file of a study, only what changes settings is read here; the laboratory reads and checks the rest (lab/studies/files.py).
 """
 
 from __future__ import annotations
@@ -11,13 +13,11 @@ import itertools
 import re
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-from pydantic import Field, PositiveFloat, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
 from iif_core.errors import InputError
-from iif_core.evaluation import catalogue
-from workflow.registry import STAGES
 from workflow.settings import relight_plans
 from workflow.settings.explain import needed
 from workflow.settings.names import configuration, did_you_mean, scene_names, scene_path
@@ -32,8 +32,6 @@ _DERIVED = re.compile(
     rf"(?P<scene>[A-Za-z0-9_-]+?)--(?:(?P<study>{STUDY})-(?P<variant>{_VARIANT.pattern})-)?s(?P<seed>0|[1-9]\d{{0,8}})"
 )
 
-MORRIS_LEVELS = 4
-"""Levels of each factor of a screening."""
 SHARED_VARIANT = "shared"
 """Name of the derived scene at whose views all variants of a study are scored."""
 BENCH = "bench"
@@ -45,46 +43,43 @@ OWN = {BENCH: "the points of the front", RELIGHT: "plans of relightings"}
 BENCH_HELD_OUT = {"capture": {"test_every": 8}}
 """Set where the scene holds no photograph out."""
 
-METRICS = tuple(name for name in catalogue.METRICS if name != "psnr_3d")
-"""Metrics that a study can show."""
-QUANTITIES = (*catalogue.PROTOCOLS_OF, "rgb_held_out", *catalogue.RELIT)
-
 
 class Variant(Section):
-    """One row of the table."""
+    """The settings of a variant."""
+
+    model_config = ConfigDict(extra="ignore")
 
     label: str = ""
     """Label in tables and pictures; by default the name of the variant."""
-    row: str = ""
-    """`scores: metrics`: row of variants.parquet that is scored; by default `result`."""
     overrides: dict[str, dict[str, Any]] = {}
     """Settings, section by section, over those of the scene."""
-    preset: Literal["ours", "published", "published_repaired"] | None = None
-    """Another method, as `preset` of a scene; by default what the scene has."""
+    preset: str | None = Field(None, pattern=r"^[a-z][a-z0-9_]*$")
+    """Settings under these, shared by studies: `config/studies/presets/<preset>.yaml`."""
 
-    @property
-    def layer(self) -> dict[str, Any]:
-        """All that the variant sets over the scene."""
-        return {**self.overrides, "preset": self.preset} if self.preset else dict(self.overrides)
+    def layer(self, root: Path) -> dict[str, dict[str, Any]]:
+        """Return all that the variant sets over the scene.
 
-
-class Paper(Section):
-    """Numbers that a publication gives for a variant."""
-
-    protocol: catalogue.ProtocolName
-    """Protocol under which its numbers were scored."""
-    values: dict[str, float]
-    """`quantity/metric` -> number."""
+        Raises:
+            InputError: there is no such preset.
+        """
+        if self.preset is None:
+            return dict(self.overrides)
+        file = configuration(f"studies/presets/{self.preset}.yaml", root)
+        if not file.is_file():
+            known = sorted(path.stem for path in file.parent.glob("*.yaml"))
+            hint = did_you_mean(self.preset, known)
+            raise InputError(f"{FOLDER}/presets/{self.preset}.yaml: not found.{hint} Known presets: {', '.join(known)}.")
+        below = read_yaml(file)
+        return {**below, **{section: {**below.get(section, {}), **keys} for section, keys in self.overrides.items()}}
 
 
 class Design(Section):
     """Variants as runs of a design: each is a string of digits, the level of every factor, which is also its name."""
 
+    model_config = ConfigDict(extra="ignore")
+
     factors: dict[str, list[Any]] = Field(min_length=1)
     """Setting, or settings joined by ` + `, -> its levels, from cheap to dear."""
-    trajectories: Literal[0] | Annotated[int, Field(ge=2)] = 0
-    """The first runs are this number of trajectories of Morris (lab/docs/studies.md): the page then has the effect of
-    each factor."""
     runs: list[str] = Field(min_length=1)
     """In the order of the trajectories; a run that is there twice is one variant."""
 
@@ -98,90 +93,27 @@ class Design(Section):
         return out
 
 
-class Opposite(Section):
-    """The variants that force a component of the plan."""
-
-    forced_in: str = ""
-    """Variant that has it; "" where nothing can put it in."""
-    forced_out: str = ""
-    """Variant without it."""
-
-
-class Plot(Section):
-    """The picture."""
-
-    kind: Literal["bars", "line", "pareto", "history"] = "bars"
-    """`bars`: variants; `line`: scores over a setting; `pareto`: over CPU time; `history`: lines, and a curve over the sweeps."""
-    x: str = ""
-    """`line`, `history`: setting on the horizontal axis, dotted, e.g. `base.predictions`."""
-    group: list[str] = []
-    """Settings that distinguish lines (or colours)."""
-    history: str = "entropy"
-    """`history`: column of the history in base.json."""
-    log: bool = False
-    """Logarithmic horizontal axis."""
-
-
-class Sheet(Section):
-    """The sheet of pictures, results/studies/<study>.grid.png and .pdf."""
-
-    views: int = Field(1, ge=1)
-    """Views of each scene, spread evenly."""
-    quantities: list[Literal["albedo", "roughness", "metallic", "relit"]] = ["albedo", "roughness", "metallic", "relit"]
-    """Rows of each view; `relit` is there in studies of relighting alone: one light of each kind."""
-    insets: dict[str, tuple[float, float, float]] = {}
-    """Scene -> [x, y, size] of a square that is shown enlarged, as shares of the width and the height."""
-
-
 class Study(Section):
-    """One file under config/studies/."""
+    """What of one file under config/studies/ changes settings."""
 
-    title: str
-    """Title of the table and the picture."""
-    scenes: list[str] = Field(min_length=1)
-    """Names of entries in config/studies/scenes.yaml."""
+    model_config = ConfigDict(extra="ignore")
+
     seeds: list[int] = Field([0, 1, 2], min_length=1)
     """Seeds of the prior; everything else keeps the seed of the scene."""
-    repeats: dict[str, Annotated[list[int], Field(min_length=1)]] = {}
-    """Variant -> further seeds, where one of `seeds` does not tell how much a score varies."""
-    scores: Literal["base_scores", "metrics", "common_scores", "relit_scores"] = "base_scores"
-    """Stage whose scores are collected: of the base texture, of the result and its re-rendering, of the result at views that all
-    variants share, or of pictures under new light."""
-    costs: list[str] = ["base"]
-    """Stages whose times are added; they are made even if the scores do not need them."""
-    growth: dict[str, dict[str, PositiveFloat]] = {}
-    """What is varied -> variant -> how much of it there is: the page then has the exponents with which `costs` grow."""
-    protocols: list[catalogue.ProtocolName] = Field(["raw", "oracle_affine"], min_length=1)
-    """Protocols in the printed table and the picture; the Parquet file has all."""
-    rows: Literal["variants", "scenes"] = "variants"
-    """Rows of the printed tables; with `scenes` each protocol has its own table."""
     common: dict[str, dict[str, Any]] = {}
     """Settings of all variants; those of a variant override them."""
     shared: dict[str, dict[str, Any]] = {}
     """`scores: common_scores`: settings, over `common`, of the capture at whose last views all variants are scored. With more
     views than any variant has, these are views that none was fitted to. Default: the capture that all studies share."""
-    opposites: dict[str, Opposite] = {}
-    """Component of the plan -> variants that force it: the page then says whether the plan, which `reference` follows, was right
-    about it."""
-    reference: str = ""
-    """Variant with which the printed table compares the others; differences are in brackets."""
     variants: dict[str, Variant] = {}
     """Name -> variant."""
     grids: list[dict[str, list[Any]]] = []
     """Each maps dotted settings to values; every combination is a variant, named after its values."""
     design: Design | None = None
     """Runs of a design, which are variants too."""
-    paper: dict[str, Paper] = {}
-    """Variant -> published numbers."""
-    show: list[str] = ["albedo/psnr", "albedo/ssim", "albedo/lpips", "roughness/l2", "metallic/l2"]
-    """`quantity/metric` in the printed table and the picture; the Parquet file has all."""
-    plot: Plot = Plot()
-    sheet: Sheet = Sheet()
-    """The sheet of pictures."""
 
-    def seeds_of(self, variant: str) -> list[int]:
-        """Return the seeds of a variant, those of all variants first."""
-        return list(dict.fromkeys([*self.seeds, *self.repeats.get(variant, [])]))
+
+AnyStudy = TypeVar("AnyStudy", bound=Study)
 
 
 class Derived(NamedTuple):
@@ -199,10 +131,20 @@ def study_names(root: Path = Path(".")) -> list[str]:
 
 
 def load_study(name: str, root: Path = Path(".")) -> Study:
-    """Return the study, with its grids expanded into variants.
+    """Return the settings of a study, with its grids and its design expanded into variants.
 
     Raises:
         InputError: names the file, the key, what was found and what is allowed.
+    """
+    path, file = study_path(name, root)
+    return _load_study(path, file, file.stat().st_mtime_ns)
+
+
+def study_path(name: str, root: Path = Path(".")) -> tuple[Path, Path]:
+    """Return the file of a study, as messages have it and where it lies.
+
+    Raises:
+        InputError: there is none, or a study cannot be called that.
     """
     path = FOLDER / f"{name}.yaml"
     names = study_names(root)
@@ -214,77 +156,46 @@ def load_study(name: str, root: Path = Path(".")) -> Study:
             " of kernels: hashgrid, base_cost (lab/docs/studies.md)."
         )
     if not re.fullmatch(STUDY, name):
-        raise InputError(f"{path}: name of a study {name!r}: allowed are lower-case letters, digits and _, a letter first")
-    file = configuration("studies", root) / path.name
-    return _load_study(path, file, root, file.stat().st_mtime_ns)
+        raise InputError(f"{path}: name of a study {name!r}: use lower-case letters, digits and _, starting with a letter")
+    return path, configuration("studies", root) / path.name
 
 
 @lru_cache(64)
-def _load_study(path: Path, file: Path, root: Path, _stamp: int) -> Study:
+def _load_study(path: Path, file: Path, _stamp: int) -> Study:
     try:
         study = Study.model_validate(read_yaml(file))
     except ValidationError as error:
-        raise InputError(_explain(error, path)) from None
+        problem = error.errors()[0]
+        where = ".".join(map(str, problem["loc"]))
+        raise InputError(f"{path}: `{where}`: found {problem.get('input')!r}. {needed(problem)}.") from None
+    return expanded(study, path)
+
+
+def expanded(study: AnyStudy, path: Path, kind: type[Variant] = Variant) -> AnyStudy:
+    """Return a study with its grids and its design expanded into variants of a type.
+
+    Raises:
+        InputError: a grid or a design that cannot be expanded, or a name that a variant cannot have.
+    """
     variants = dict(study.variants)
     for i, grid in enumerate(study.grids):
-        for name, variant in _grid(grid, f"{path}: `grids.{i}`").items():
+        for name, variant in _grid(grid, f"{path}: `grids.{i}`", kind).items():
             if name in variants:
                 raise InputError(f"{path}: `grids.{i}`: variant {name} is there already; give each its own setting")
             variants[name] = variant
     if study.design:
-        variants |= _design(study.design, path, variants)
+        variants |= _design(study.design, path, variants, kind)
     if study.shared and SHARED_VARIANT in variants:
         raise InputError(f"{path}: a variant cannot be called {SHARED_VARIANT}, which is the capture of `shared`; rename it")
-    if not variants:
-        raise InputError(f"{path}: no variants; add `variants: {{<name>: {{overrides: ...}}}}` or `grids`")
     for name in variants:
         if not _VARIANT.fullmatch(name):
             raise InputError(
                 f"{path}: `variants`: found the name {name!r}; use letters, digits, _ and -, starting with a letter or digit"
             )
-    for name in study.paper:
-        if name not in variants:
-            raise InputError(f"{path}: `paper.{name}`: no such variant. Allowed here: {', '.join(variants)}.")
-    shown = [(f"paper.{name}.values", key) for name, paper in study.paper.items() for key in paper.values]
-    for where, key in [*shown, *(("show", key) for key in study.show)]:
-        quantity, _, metric = key.partition("/")
-        if quantity not in QUANTITIES or metric not in METRICS:
-            raise InputError(
-                f"{path}: `{where}`: found {key!r}, needed <quantity>/<metric>"
-                f" with {', '.join(QUANTITIES)} and {', '.join(METRICS)}"
-            )
-    varied = sorted({f"{section}.{key}" for v in variants.values() for section, keys in v.overrides.items() for key in keys})
-    wanted = [study.plot.x] if study.plot.kind in ("line", "history") else []
-    for dotted in [*wanted, *study.plot.group]:
-        if dotted not in varied:
-            raise InputError(f"{path}: `plot`: no variant sets {dotted or 'x'!r}. Allowed here: {', '.join(varied) or 'none'}.")
-    shared = scene_overrides(root)
-    if study.reference and study.reference not in variants:
-        raise InputError(f"{path}: `reference: {study.reference}`: no such variant. Allowed here: {', '.join(variants)}.")
-    if study.opposites and not study.reference:
-        raise InputError(f"{path}: `opposites` need a `reference`, the variant that leaves them to the plan")
-    for component, opposite in study.opposites.items():
-        for name in filter(None, (opposite.forced_in, opposite.forced_out)):
-            if name not in variants:
-                raise InputError(f"{path}: `opposites.{component}`: no variant {name}. Allowed here: {', '.join(variants)}.")
-    for name in study.repeats:
-        if name not in variants:
-            raise InputError(f"{path}: `repeats.{name}`: no such variant. Allowed here: {', '.join(variants)}.")
-    for stage in study.costs:
-        if stage not in STAGES:
-            raise InputError(f"{path}: `costs`: {stage} is no stage. Allowed here: {', '.join(STAGES)}.")
-    for what, sizes in study.growth.items():
-        for name in sizes:
-            if name not in variants:
-                raise InputError(f"{path}: `growth.{what}`: no variant {name}. Allowed here: {', '.join(variants)}.")
-    for scene in study.scenes:
-        if scene not in shared:
-            hint = did_you_mean(scene, shared)
-            raise InputError(f"{path}: `scenes`: {scene} is not in {SCENES}.{hint} Allowed here: {', '.join(shared)}.")
     return study.model_copy(update={"variants": variants})
 
 
-def _grid(grid: dict[str, list[Any]], where: str) -> dict[str, Variant]:
+def _grid(grid: dict[str, list[Any]], where: str, kind: type[Variant]) -> dict[str, Variant]:
     for key, values in grid.items():
         if key.count(".") != 1 or not values:
             raise InputError(f"{where}: found `{key}: {values}`, needed <section>.<key>: [value, ...]")
@@ -295,11 +206,11 @@ def _grid(grid: dict[str, list[Any]], where: str) -> dict[str, Variant]:
             section, _, key = dotted.partition(".")
             overrides.setdefault(section, {})[key] = value
         words = [re.sub(r"[^A-Za-z0-9_]", "_", str(value)) for value in values]
-        out["-".join(words)] = Variant(label=", ".join(str(value) for value in values), overrides=overrides)
+        out["-".join(words)] = kind(label=", ".join(str(value) for value in values), overrides=overrides)
     return out
 
 
-def _design(design: Design, path: Path, others: dict[str, Variant]) -> dict[str, Variant]:
+def _design(design: Design, path: Path, others: dict[str, Variant], kind: type[Variant]) -> dict[str, Variant]:
     for names, levels in design.factors.items():
         if not 1 <= len(levels) <= 10 or any(dotted.count(".") != 1 for dotted in names.split(" + ")):
             raise InputError(
@@ -316,39 +227,8 @@ def _design(design: Design, path: Path, others: dict[str, Variant]) -> dict[str,
             )
         if run in others:
             raise InputError(f"{path}: `design.runs`: variant {run} is there already; give it another name")
-        out[run] = Variant(label=run, overrides=design.overrides(run))
-    whole = len(design.factors) + 1
-    if design.trajectories:
-        _check_trajectories(design, whole, path)
-    if len(design.runs) < design.trajectories * whole:
-        raise InputError(
-            f"{path}: `design.trajectories`: found {design.trajectories}, which are {design.trajectories * whole} runs;"
-            f" there are {len(design.runs)}. lab/docs/studies.md says what makes them"
-        )
+        out[run] = kind(label=run, overrides=design.overrides(run))
     return out
-
-
-def _check_trajectories(design: Design, whole: int, path: Path) -> None:
-    """Refuse runs that are no trajectories: steps of one factor by two of four levels, each factor once."""
-    odd = [name for name, levels in design.factors.items() if len(levels) != MORRIS_LEVELS]
-    if odd:
-        raise InputError(f"{path}: `design.factors`: {', '.join(odd)}: trajectories need {MORRIS_LEVELS} levels of each factor")
-    runs = design.runs[: design.trajectories * whole]
-    for number in range(0, len(runs) - whole + 1, whole):
-        one = runs[number : number + whole]
-        moved = [[i for i, (a, b) in enumerate(zip(*pair, strict=True)) if a != b] for pair in itertools.pairwise(one)]
-        far = all(
-            abs(int(a) - int(b)) in (0, MORRIS_LEVELS // 2) for x, y in itertools.pairwise(one) for a, b in zip(x, y, strict=True)
-        )
-        if (
-            not far
-            or sorted(i for step in moved for i in step) != list(range(whole - 1))
-            or any(len(step) != 1 for step in moved)
-        ):
-            raise InputError(
-                f"{path}: `design.runs`: those from {one[0]!r} on are no trajectory, in which each step changes one factor by"
-                f" two levels and each factor changes once. lab/docs/studies.md says what makes them"
-            )
 
 
 def scenes_path(root: Path = Path(".")) -> Path:
@@ -406,7 +286,7 @@ def layers(parts: Derived, root: Path = Path(".")) -> list[tuple[str, dict[str, 
             )
         if study.common:
             out.append((f"{FOLDER / parts.study}.yaml, `common`", study.common))
-        out.append((f"{FOLDER / parts.study}.yaml, variant {parts.variant}", study.variants[parts.variant].layer))
+        out.append((f"{FOLDER / parts.study}.yaml, variant {parts.variant}", study.variants[parts.variant].layer(root)))
     return [*out, ("seed of the study", {"prior": {"seed": parts.seed}})]
 
 
@@ -453,21 +333,3 @@ def scene_of(study: str, scene: str, variant: str, seed: int) -> str:
     'kitchen--aggregation-full-s0'
     """
     return f"{scene}--{study}-{variant}-s{seed}"
-
-
-def _explain(error: ValidationError, path: Path) -> str:
-    lines = []
-    for problem in error.errors():
-        where, found = problem["loc"], problem.get("input")
-        dotted = ".".join(str(part) for part in where)
-        if problem["type"] == "extra_forbidden":
-            model = {1: Study, 2: Plot}.get(len(where), Paper if where[0] == "paper" else Variant)
-            allowed = list(model.model_fields)
-            hint = did_you_mean(where[-1], allowed, "`{}`")
-            lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
-        elif problem["type"] == "missing":
-            lines.append(f"{path}: `{dotted}`: missing. Add it; config/studies/aggregation.yaml is a complete example.")
-        else:
-            shown = found if not isinstance(found, dict) else "a mapping"
-            lines.append(f"{path}: `{dotted}`: found {shown!r}. {needed(problem)}.")
-    return "\n".join(lines)

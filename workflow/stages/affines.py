@@ -12,16 +12,12 @@ from iif_core.camera.gains import CameraGains
 from iif_core.camera.response import Response, response_from_facts
 from iif_core.fitting.clusters import patches
 from iif_core.fitting.direct import fit_affines
-from iif_core.fitting.gauge import Gauge, apply_gauge
+from iif_core.fitting.gauge import apply_gauge
 from iif_core.fitting.object_levels import prediction_scatter
-from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, SgdOptions
-from iif_core.fitting.published import PublishedOptions, PublishedState, fit_published
-from iif_core.fitting.reference_loss import reference_loss
-from iif_core.fitting.sgd import fit_affines_sgd
+from iif_core.fitting.problem import FitOptions, FitProblem, FitResult
 from iif_core.light.base_scene import BaseScene
 from workflow.artifacts.scratch import Joined
 from workflow.decisions import materials
-from workflow.fitting import baselines
 from workflow.fitting.affine_files import plan_of_fit, write_cells, write_facts, write_maps, write_objects
 from workflow.fitting.asked import Places, find_gauge, given_materials
 from workflow.fitting.cell_textures import CellTextures
@@ -35,81 +31,75 @@ from workflow.scene.named import object_names
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import write_response
 
+Solver = Callable[[FitProblem, Response], FitResult]
+"""From the problem and the response of stage emission to the fit, in the gauge of the given light."""
+
 
 def run(job: Job) -> None:
     """Write objects.parquet, camera_response.parquet (LDR), cells.parquet, maps/<view>.exr and affines.json."""
-    if job.settings.affines.model != "objects":
-        return baselines.run(job)
+    fit(job, _direct)
+
+
+def fit(
+    job: Job,
+    solver: Callable[[Job, tuple[np.ndarray, np.ndarray] | None], Solver],
+    name: str = "direct",
+    draw: Callable[[Job, DecodedViews, BaseScene, np.ndarray], FitPixels] | None = None,
+    merged: bool = False,
+) -> None:
+    """Fit one affine map for each object and write the artefacts of the stage.
+
+    Args:
+        job: the job.
+        solver: makes the solver from the settings, and mean and precision of the response; name: of it, for affines.json.
+        draw: chooses the pixels, given the faces (m,) bool whose pixels are left out; None: evenly over the objects.
+        merged: read the mean of the two halves of the light, for a solver that does not ask how far they are apart.
+    """
     capture, (scene, light) = CaptureReader(job.read("capture")), read_lit_scene(job)
     names = object_names(job.read("segmentation"), scene.n_objects)
     gauge, given = find_gauge(job, capture, names), given_materials(job, names)  # wrong settings stop the stage before any work
     mixed = light.emits | scene.is_sheer
-    problem, places = _problem(job, capture, scene, mixed, read_gains(job))
+    decoded = DecodedViews(capture, job.read("segmentation"))
+    drawn = (draw or _drawn)(job, decoded, scene, mixed)
+    problem, places = _problem(job, decoded, scene, drawn, read_gains(job), merged)
+    del decoded  # the solver needs the memory
     problem = replace(problem, given=given)
     start, prior, calibration = _starting_response(job)
     job.log.info("%d pixels of %d objects", len(problem.object_id), len(np.unique(problem.object_id)))
     textures = CellTextures.of(job, capture, scene, mixed)
-    fit, free = _fitted(job, problem, start, prior, places, gauge)
+    with job.timed("solve"):
+        free = solver(job, prior)(problem, start)
+    found = apply_gauge(problem, free, gauge(problem, places))
     for o in range(scene.n_objects):
-        job.log.debug("%s: %s, residual %.4f", names[o], fit.model[o], fit.residual[o])
-    write_objects(job, names, fit, given)
+        job.log.debug("%s: %s, residual %.4f", names[o], found.model[o], found.residual[o])
+    write_objects(job, names, found, given)
     if not capture.is_hdr:
-        write_response(job, fit.response)
-    albedo = textures.albedo(fit) if textures is not None else None
-    write_cells(job, fit, albedo)
-    write_maps(job, capture, fit, albedo)
-    metals = job.settings.override.components.metallic
-    plan = plan_of_fit(problem, fit, calibration, capture.facts["dynamic_range"], metals)
+        write_response(job, found.response)
+    albedo = textures.albedo(found) if textures is not None else None
+    write_cells(job, found, albedo)
+    write_maps(job, capture, found, albedo)
+    metals = job.settings.components.metallic
+    plan = plan_of_fit(problem, found, calibration, capture.facts["dynamic_range"], metals)
     if given is not None:
         plan.append(materials.given_by_hand(names, given))
-    loss = reference_loss(problem, free.affine, free.response)
-    write_facts(job, fit, loss.__dict__, plan)
+    write_facts(job, name, found, plan)
 
 
-def _fitted(
-    job: Job,
-    problem: FitProblem,
-    start: Response,
-    prior: tuple[np.ndarray, np.ndarray] | None,
-    places: Places,
-    gauge: Callable[[FitProblem, Places], Gauge],
-) -> tuple[FitResult, FitResult]:
-    """Return the fit in its gauge, and in the gauge of the given light."""
-    with job.timed("solve"):
-        free = _solver(job, prior)(problem, start)
-    return apply_gauge(problem, free, gauge(problem, places)), free
-
-
-def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Callable[[FitProblem, Response], FitResult]:
-    """Return the solver that the settings name; `prior` is mean and precision of the response."""
+def _direct(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Solver:
     settings = job.settings.affines
-    if settings.solver == "direct":
-        options = FitOptions(
-            iterations=settings.iterations,
-            population=settings.population,
-            robust_width=settings.robust_width,
-            response_prior=prior,
-            # This prior read the brightness of objects from the same photographs.
-            base_tells_levels=job.settings.prior.kind != "retinex",
-            lobes=has_lobes(job),
-            metals=job.settings.override.components.metallic != "off",
-            prediction_errors=prediction_errors(job),
-            threads=job.threads,
-        )
-        return lambda problem, start: fit_affines(problem, start, options)
-    if settings.solver == "published":
-        rate = PublishedOptions.rate if settings.rate is None else settings.rate
-        published = PublishedOptions(rate, epochs=settings.epochs, batch=settings.batch, seed=job.seed)
-        kept = job.kept_state("descent")
-        at = kept and PublishedState(**kept[0], step=kept[1]["step"], loss=tuple(kept[1]["loss"]))
-
-        def keep(state: PublishedState) -> None:
-            facts = {"step": state.step, "loss": list(state.loss)}
-            job.keep_state("descent", {"affine": state.affine, "params": state.params}, facts)
-
-        return lambda problem, start: fit_published(problem, start, published, at, keep)
-    own = SgdOptions(settings.solver, settings.rate, settings.epochs, settings.batch, seed=job.seed)
-    return lambda problem, start: fit_affines_sgd(problem, start, own)
+    options = FitOptions(
+        iterations=settings.iterations,
+        population=settings.population,
+        robust_width=settings.robust_width,
+        response_prior=prior,
+        # This prior read the brightness of objects from the same photographs.
+        base_tells_levels=job.settings.prior.kind != "retinex",
+        lobes=has_lobes(job),
+        metals=job.settings.components.metallic != "off",
+        prediction_errors=prediction_errors(job),
+        threads=job.threads,
+    )
+    return lambda problem, start: fit_affines(problem, start, options)
 
 
 # -------------------------------------------------------------------------------------------------------------- input
@@ -125,24 +115,24 @@ def _starting_response(job: Job) -> tuple[Response, tuple[np.ndarray, np.ndarray
     return start, (start.params.ravel(), np.linalg.inv(np.asarray(known["covariance"], np.float64))), known
 
 
+def _drawn(job: Job, decoded: DecodedViews, scene: BaseScene, mixed: np.ndarray) -> FitPixels:
+    """Draw the pixels of the fit evenly over the objects (docs/method/fitting.md#which-pixels)."""
+    asked, counts = job.settings.affines.pixels, np.zeros(max(scene.n_objects, 1), np.int64)
+    for view in decoded.capture.used:
+        counts += count_eligible(decoded.pixels(view, scene.normals), mixed, scene.n_objects)
+    return FitPixels.evenly(counts, int(counts.sum()) if asked == "all" else asked, mixed, job.seed)
+
+
 def _problem(
-    job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray, gains: CameraGains
+    job: Job, decoded: DecodedViews, scene: BaseScene, drawn: FitPixels, gains: CameraGains, merged: bool
 ) -> tuple[FitProblem, Places]:
-    """Draw the pixels of the fit evenly over objects and read their cached shading (docs/method/fitting.md#which-pixels)."""
-    decoded = DecodedViews(capture, job.read("segmentation"))
-    views, asked, published = capture.used, job.settings.affines.pixels, job.settings.affines.solver == "published"
-    if published and asked == "all":
-        drawn = FitPixels.every(scene.n_objects, mixed)
-    else:
-        counts = np.zeros(max(scene.n_objects, 1), np.int64)
-        for view in views:
-            counts += count_eligible(decoded.pixels(view, scene.normals), mixed, scene.n_objects)
-        drawn = FitPixels.evenly(counts, int(counts.sum()) if asked == "all" else asked, mixed, job.seed)
+    """Read the pixels of the fit with their cached shading."""
+    capture, views = decoded.capture, decoded.capture.used
     levels = roughness_levels(job)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("object", "value", "exposure", "view", "index", "cell")}
-    # What grows with pixels x levels is joined on disk; the published fit takes the mean of the halves.
-    folder = job.writer.directory
-    base, cached = Joined(folder), [[Joined(folder) for _ in range(3)] for _ in range(1 if published else 2)]
+    # What grows with pixels x levels is joined on disk.
+    folder, halves = job.writer.directory, (slice(None),) if merged else (slice(1), slice(1, 2))
+    base, cached = Joined(folder), [[Joined(folder) for _ in range(3)] for _ in halves]
     for done, view in enumerate(views):
         pixels, specular = decoded.pixels(view, scene.normals), read_specular(job, view)
         pixels = pixels.take(drawn.of(pixels, view))
@@ -156,7 +146,7 @@ def _problem(
         rows["index"].append(index.astype(np.int32))
         rows["cell"].append(cells_of(job, view)[index])
         specular, diffuse = specular.at(index), read_diffuse(job, view).reshape(2, -1, 3)[:, index]
-        for layers, half in zip(cached, (slice(None),) if published else (slice(1), slice(1, 2)), strict=True):
+        for layers, half in zip(cached, halves, strict=True):
             for layer, part in zip(layers, (diffuse, specular.s0, specular.s1), strict=True):
                 layer.add(balanced(part[half].mean(0), balance))
         job.progress(done + 1, len(views), "views read")
@@ -175,7 +165,7 @@ def _problem(
         value,
         joined["exposure"],
         saturated,
-        None if published else _patches(scene, object_id, joined["cell"].astype(np.int64)),
+        None if merged else _patches(scene, object_id, joined["cell"].astype(np.int64)),
         _scatter(job, scene.n_objects),
     )
     return problem, Places(joined["view"], joined["index"])

@@ -17,6 +17,7 @@ from iif_core.light.emission.sensor import Sensor
 from iif_core.light.tracer import Tracer
 from iif_core.surface.segments import face_adjacency
 from workflow.decisions import light as decisions
+from workflow.decisions.plan import environment as from_outside
 from workflow.decisions.plan import included
 from workflow.decisions.record import SETTLED, Decision
 from workflow.runtime import device
@@ -27,16 +28,11 @@ from workflow.scene.light_files import write_found_light
 from workflow.scene.named import object_names
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.response_file import read_response_file
-from workflow.settings.light import PUBLISHED
 
 
 def run(job: Job) -> None:
     """Write emitters.parquet, emitter_faces.parquet, object_gains.parquet, radiance_cache.parquet, environment_texels.parquet
     and emission.json."""
-    if job.settings.emission.solver in PUBLISHED:
-        from workflow.published import emission
-
-        return emission.run(job)
     device.mitsuba()
     notes: list[str] = []
     photos, camera = _photographs(job, CaptureReader(job.read("capture")), notes)
@@ -67,9 +63,6 @@ def _photographs(job: Job, capture: CaptureReader, notes: list[str]) -> tuple[Ph
         samples=own.samples,
         max_bounces=own.max_bounces,
         prune=own.prune,
-        solver=own.solver,
-        preset=own.preset,
-        iterations=own.iterations,
     )
     photos = Photographs(
         views=capture.used,
@@ -106,4 +99,4 @@ def _environment(job: Job, photos: Photographs, look: FirstLook) -> Decision:
     # Where light passes through surface, the mesh is another one than the plan was made for.
     if planned["status"] == SETTLED and photos.scene.transmittance is None:
         return planned
-    return decisions.environment(job.settings.emission.environment, look.primary, look.secondary, look.brightness)
+    return from_outside(job.settings.emission.environment, look.primary, look.secondary, look.brightness)

@@ -18,11 +18,14 @@ from workflow.scene.probes import probe_rows
 def run(job: Job) -> None:
     """Write plan.json and plan.yaml: every component, in or out, settled, provisional or forced, and the evidence."""
     capture = CaptureReader(job.read("capture"))
-    if job.settings.shading.method == "published" or job.settings.emission.solver.startswith("published"):
-        plan, facts = decisions.not_planned(), {}
-    else:
-        plan, facts = _probed(job, capture)
-    plan += decisions.later(capture.is_hdr, bool(capture.facts.get("exposure_estimated")), {item["component"] for item in plan})
+    write(job, capture, *_probed(job, capture))
+
+
+def write(job: Job, capture: CaptureReader, plan: list[Decision], facts: dict[str, Any]) -> None:
+    """Write the plan, with what later stages decide added to what is known now; `facts`: what the probes looked at."""
+    plan = plan + decisions.later(
+        capture.is_hdr, bool(capture.facts.get("exposure_estimated")), {item["component"] for item in plan}
+    )
     plan = [decisions.with_override(item) for item in plan]
     for item in plan:
         job.log.info("%s: %s (%s): %s", item["component"], "in" if item["included"] else "out", item["status"], item["reason"])
@@ -45,7 +48,7 @@ def _probed(job: Job, capture: CaptureReader) -> tuple[list[Decision], dict[str,
     plan = [
         decisions.environment(settings.emission.environment, *escape, rows.outside, light["environment"]),
         decisions.emitters(capture.is_hdr, light["emitters"]),
-        decisions.specular(settings.override.components.specular, gloss),
+        decisions.specular(settings.components.specular, gloss),
         decisions.radiance_cache(rows.photographed),
     ]
     facts = {

@@ -11,8 +11,7 @@ import numpy as np
 from iif_core.evaluation.catalogue import METRICS
 from iif_core.numerics import color
 from workflow.artifacts.store import ids_from_disk, material_maps, prediction_numbers, rgb
-from workflow.decisions import numerics
-from workflow.decisions.expected import whole, with_expectation
+from workflow.decisions import expected, numerics
 from workflow.decisions.plan import GAINS, with_override
 from workflow.decisions.record import FORCED, PROVISIONAL, SETTLED, plan_text
 from workflow.exporters.object_table import read_csv
@@ -34,6 +33,7 @@ from workflow.report.page import (
 )
 from workflow.report.verdict import LIMITS, Evidence, judge
 from workflow.report.wording import fit_words, percent, reason_words, significant
+from workflow.runtime import forecast
 from workflow.runtime.job import Job
 from workflow.runtime.timings import read_timings
 from workflow.scene.base_scene import read_base
@@ -54,7 +54,7 @@ PLAN_KEYS = (
     "error_nats",
     "rows",
     "reason",
-    "override",
+    "components",
 )
 ERROR_RANGE = 0.25
 COVERAGE_RANGE = 4.0
@@ -76,8 +76,8 @@ def run(job: Job) -> None:
     capture = CaptureReader(job.read("capture"))
     recovered = read_recovered(job)
     summary = job.read("metrics").json("summary.json")
-    cost = whole(job.scene, job.quality)
-    plan = [with_expectation(item, cost) for item in collect_plan(job)]
+    cost = forecast.together(expected.STAGES, job.scene, job.quality)
+    plan = [expected.with_expectation(item, cost) for item in collect_plan(job)]
     job.writer.bytes("plan.yaml", plan_text(job.scene, job.quality, plan).encode())
     response_svg, response_note = _response(job, capture)
     emission = _document(job, "emission", "emission.json")

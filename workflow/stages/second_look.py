@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from collections.abc import Callable
 
 import numpy as np
 
@@ -14,13 +15,15 @@ from workflow.runtime.job import Job
 from workflow.scene.base_scene import SECOND_LOOK
 from workflow.scene.cached_light import read_diffuse
 from workflow.scene.normal_form import CaptureReader, View
-from workflow.scene.predictions import StoredPredictions
+from workflow.scene.predictions import Predictions, StoredPredictions
 from workflow.stages.base import fuse
 
 
-def run(job: Job) -> None:
+def run(job: Job, fuse: Callable[[Job, Predictions], None] = fuse) -> None:
     """Write second_look.json and, with prior `learned`, everything that stage base writes, from new predictions. The predictions
-    themselves are not kept."""
+    themselves are not kept.
+
+    fuse: puts predictions together and writes the files of stage base."""
     kinds = [own.kind for own in members(job.settings.prior)]
     if "learned" not in kinds or not job.settings.second_look.enabled:
         why = "second_look: {enabled: false}" if "learned" in kinds else f"prior {' and '.join(kinds)} does not use the light"

@@ -38,10 +38,6 @@ def run(job: Job) -> None:
     specular integrals of the pixels that are read, both in two independent halves, levels.parquet and shading.json.
 
     In a scene without specular lobes nothing is traced for the pixels: their lobes are those of uniform light (Eq. S.22)."""
-    if job.settings.shading.method == "published":
-        from workflow.published import shading
-
-        return shading.run(job)
     from iif_core.light.transport.scene import Scene
 
     (scene, light), own = read_lit_scene(job), job.settings.shading

@@ -1,2 +1,1 @@
-"""Speed against accuracy: the points of the measured front, and which of them a budget or a target asks for
-(docs/guide/quality.md)."""
+"""Speed against accuracy: the measured qualities, and which of them a time or a score asks for (docs/guide/quality.md)."""

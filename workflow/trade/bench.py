@@ -1,4 +1,4 @@
-"""`bench/<scene>`: three points of the front in a room of one's own, what they took and what they scored."""
+"""`bench/<scene>`: three measured qualities in a room of one's own: what they took and what they scored."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def measured(scene: str, score: str) -> dict[str, float] | None:
 
 
 def write_bench(scene: str, cores: int = 2) -> None:
-    """Write bench.json, which `--config target=...` reads, and bench.md, which a person reads."""
+    """Write bench.json, which `--config quality=<score>:<dB>` reads, and bench.md, which a person reads."""
     folder, points, rows, now = FOLDER / scene, {}, [], marks(scene)
     links.check_folder(str(folder))
     folder.mkdir(parents=True, exist_ok=True)
@@ -72,8 +72,8 @@ def write_bench(scene: str, cores: int = 2) -> None:
         rows.append([point, f"{seconds:.0f}", expected, f"{memory:.0f}", *shown])
     factor = machine_factor()
     write_json(folder / "bench.json", {"scene": scene, "machine": round(factor, 3), "points": points})
-    head = ["point", "s of its jobs", "expected for the whole run from now on", "peak MB", *HEADS.values()]
-    lines = [f"# {scene}: three points of the front", ""]
+    head = ["quality", "s of its jobs", "expected for the whole run from now on", "peak MB", *HEADS.values()]
+    lines = [f"# {scene}: three qualities", ""]
     lines += ["| " + " | ".join(head) + " |", "|---|---:|---:|---:|---:|---:|"]
     lines += ["| " + " | ".join(row) + " |" for row in rows]
     lines += ["", *(f"{HEADS[name]}: {words}." for name, words in WORDS.items())]

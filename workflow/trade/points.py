@@ -1,4 +1,4 @@
-"""The points of the measured front and what they scored (points.json, from the study `tradeoff`)."""
+"""The qualities of the measured front and what they scored (points.json, from the study `tradeoff`)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from workflow.settings.names import QUALITIES, REPOSITORY, configuration, did_you_mean
+from workflow.settings.names import QUALITIES, REPOSITORY, configuration
 from workflow.settings.yaml_file import read_yaml
 
 SHIPPED = Path(__file__).with_name("points.json")
@@ -23,7 +23,7 @@ WORDS = {
 
 
 class Expected(NamedTuple):
-    """A score of a point: mean over the rooms of the study, the smallest and the largest."""
+    """A score of a quality: mean over the rooms of the study, the smallest and the largest."""
 
     mean: float
     low: float
@@ -41,15 +41,6 @@ class Point(NamedTuple):
         return Expected(sum(values) / len(values), min(values), max(values))
 
 
-class Pooled(NamedTuple):
-    """A variant over all rooms: geometric mean of its CPU seconds, mean of its albedo score in dB, and both in each room."""
-
-    variant: str
-    cpu_seconds: float
-    albedo: float
-    rooms: Mapping[str, Mapping[str, float]]
-
-
 @lru_cache(None)
 def points(path: Path = SHIPPED) -> dict[str, Point]:
     """Return the points, the cheapest first."""
@@ -58,9 +49,9 @@ def points(path: Path = SHIPPED) -> dict[str, Point]:
 
 
 def named() -> dict[str, str]:
-    """Return quality -> the point that it stands for; a quality that is no point of the front, or more than one, is not in it."""
+    """Return `draft`, ... -> the point that it stands for; one that is no point of the front, or more than one, is not in it."""
     settings = {quality: read_yaml(configuration(f"quality/{quality}.yaml")) for quality in QUALITIES}
-    return {quality: document["point"] for quality, document in settings.items() if set(document) == {"point"}}
+    return {quality: document["quality"] for quality, document in settings.items() if set(document) == {"quality"}}
 
 
 def point_of(quality: str) -> Point | None:
@@ -74,11 +65,6 @@ def bench_points() -> list[str]:
     """Return the three points that `bench` runs: the cheapest, and those a third and two thirds of the way along the front."""
     names = list(points())
     return list(dict.fromkeys(names[round(share * (len(names) - 1))] for share in (0.0, 1 / 3, 2 / 3)))
-
-
-def unknown(name: str) -> str:
-    """Return what is said about a point that does not exist."""
-    return f"unknown point.{did_you_mean(name, points())} Allowed: {', '.join(points())}"
 
 
 def measured_scores(summary: Mapping[str, Any]) -> dict[str, float]:

@@ -24,7 +24,6 @@ from iif_core.light.emission.environment import Sky, sky_prior
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, BaseAlbedo, GainOptions, ObjectGains
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.hidden import with_hidden_surface
-from iif_core.light.emission.loss import reference_loss
 from iif_core.light.emission.photographs import SEEDS, Photographs, choose_rows, joined, radiance_cache, seen_faces
 from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import (
@@ -38,7 +37,6 @@ from iif_core.light.emission.problem import (
 from iif_core.light.emission.pruning import PrunedEmission, WhiteSurface, insignificant, prune_groups
 from iif_core.light.emission.rows import TracedTransport, light_of
 from iif_core.light.emission.search import HIDDEN_EXCESS, QUICK, Candidates, Families, search
-from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
 from iif_core.light.tracer import Tracer
 from iif_core.surface.cells import pack_keys, voxel_indices
 
@@ -218,13 +216,13 @@ def search_emitters(
 
 def solve_with_saturated_surface(
     photos: Photographs, unseen: Tracer, found: Traced, sky: Sky | None, threshold: float
-) -> tuple[Traced, EmissionSolution, float]:
+) -> tuple[Traced, EmissionSolution]:
     """Solve, and solve once more if saturated surface that only reflects turns out to be much brighter than its bound.
 
     The bounds of the cache are raised to what the surface reflects of the light that was found (Eq. L.42), up to three times.
-    Returns the problem, with the cache that goes with it, its solution, and the loss of that.
+    Returns the problem, with the cache that goes with it, and its solution.
     """
-    solution, loss = solve(photos, found, sky)
+    solution = solve(photos, found, sky)
     bounds = found.cache
     for _ in range(SATURATED_ROUNDS):
         cache = _raised(photos, unseen, found, bounds, solution.radiance, sky)
@@ -233,8 +231,8 @@ def solve_with_saturated_surface(
         more = float(cache.radiance.sum()) / max(float(bounds.radiance.sum()), 1e-300) - 1.0
         photos.log.say(f"saturated surface adds {100 * more:.0f} % to the cached light")
         found = traced(photos, unseen, found.groups, sky, threshold, voxels=cache)
-        solution, loss = solve(photos, found, sky)
-    return found, solution, loss
+        solution = solve(photos, found, sky)
+    return found, solution
 
 
 def in_doubt(photos: Photographs, found: Traced, solution: EmissionSolution) -> np.ndarray:
@@ -344,8 +342,8 @@ def _names(photos: Photographs, groups: EmitterGroups, family: np.ndarray, numbe
     return f"{unseen}{name} ({groups.area[own].sum():.2g} m^2)"
 
 
-def solve(photos: Photographs, found: Traced, sky: Sky | None) -> tuple[EmissionSolution, float]:
-    """Solve for the groups that shine, which are black from here on, and for the environment; return also the loss."""
+def solve(photos: Photographs, found: Traced, sky: Sky | None) -> EmissionSolution:
+    """Solve for the groups that shine, which are black from here on, and for the environment."""
     problem, prior = found.problem, found.prior
     initial = prior.initial
     family = _families(photos, found.groups, len(initial))
@@ -354,16 +352,7 @@ def solve(photos: Photographs, found: Traced, sky: Sky | None) -> tuple[Emission
         outside = np.arange(found.groups.size, len(initial))
         together = outside if sky.sun is None else np.delete(outside, sky.sun)  # a sun is not like the sky around it
         family[together], width[together] = -1 - len(initial), OUTSIDE_WIDTH
-    settings = photos.options
-    if settings.solver == "sgd":
-        # Which groups emit is known by now, so `safe` has nothing to prune.
-        prune = ((100, 0.0), (1000, 0.05)) if settings.preset == "paper" else ()
-        options = SgdOptions(settings.preset, settings.iterations or SgdOptions.steps, prune=prune, seed=settings.seed)
-        solution = solve_emission_sgd(problem.rows, initial, options)
-    else:
-        solution = solve_families(problem.rows, prior, family, width)
-    solution = solution.with_level_error(found.level_error)
-    return solution, reference_loss(problem.rows, solution.radiance)
+    return solve_families(problem.rows, prior, family, width).with_level_error(found.level_error)
 
 
 def _families(photos: Photographs, groups: EmitterGroups, n_groups: int) -> np.ndarray:

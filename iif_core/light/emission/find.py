@@ -59,7 +59,7 @@ class FoundLight:
 
     Attributes:
         photos: with that assumption; look: the first look at them.
-        found: the problem; solution, loss: of it.
+        found: the problem; solution: of it.
         left_out, reasons: candidate groups that turned out to reflect, and why.
         gain: (n_objects, 3) of the albedos.
         outside: the sky, None = none; sun: what speaks for one in it.
@@ -71,7 +71,6 @@ class FoundLight:
     look: FirstLook
     found: Traced
     solution: EmissionSolution
-    loss: float
     left_out: EmitterGroups
     reasons: list[str]
     gain: np.ndarray
@@ -157,21 +156,20 @@ def find_light(photos: Photographs, look: FirstLook, environment: bool, is_open:
     reasons[pruned.kept[: groups.size] & ~shines] = "the photographs are explained better without it"
     reasons[shines] = ""
     hidden = int(found.groups.is_hidden.sum())
-    found, solution, loss = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
+    found, solution = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
     weak = in_doubt(photos, found, solution)
     if weak.any() and (outside is not None or not weak.all()):  # without light from outside something in the room has to shine
         photos.log.say(f"{weak.sum()} groups radiate no more than their error allows, and are taken out")
         visible = np.flatnonzero(shines)
         reasons[visible[weak[: len(visible)]]] = f"its radiance is within {SIGNIFICANT:.0f} standard errors of zero"
         found = traced(photos, unseen, found.groups.select(~weak), outside, threshold)
-        found, solution, loss = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
+        found, solution = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
     gain = reliable(found.gains) if len(found.prior.initial) else gain  # without emitters those of the trial stay
     return FoundLight(
         photos=photos,
         look=look,
         found=found,
         solution=solution,
-        loss=loss,
         left_out=groups.select(reasons != ""),
         reasons=[reason for reason in reasons if reason],
         gain=gain,

@@ -16,7 +16,6 @@ class EmissionOptions:
         cache_edge: edge of a voxel of the radiance cache, metres.
         rows: pixels whose light transport is traced; samples: paths for each, over two halves; max_bounces: their longest.
         prune: share of the photographed light below which an emitter is dropped, unless it is missed.
-        solver: `direct` or `sgd`; preset, iterations: of `sgd`.
     """
 
     seed: int
@@ -26,9 +25,6 @@ class EmissionOptions:
     samples: int
     max_bounces: int
     prune: float
-    solver: str = "direct"
-    preset: str = "safe"
-    iterations: int | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,40 @@
+"""Which module runs a stage in the place of the product's, with given settings (lab/plugins.py); None: the product's own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+PUBLISHED = "lab.published.stages"
+
+
+def plan(settings: dict[str, Any]) -> str | None:
+    """The published method decides about the parts of the model itself."""
+    return f"{PUBLISHED}.plan" if emission(settings) or shading(settings) else None
+
+
+def base(settings: dict[str, Any]) -> str | None:
+    """Another solver, loss or variant of ours."""
+    own, ours = settings["base"], {"solver": "direct", "variant": "full", "objective": "least_squares", "judge": False}
+    return f"{PUBLISHED}.base" if any(own[name] != value for name, value in ours.items()) else None
+
+
+def emission(settings: dict[str, Any]) -> str | None:
+    """The published descent to emitters."""
+    return f"{PUBLISHED}.emission" if settings["emission"]["solver"] != "direct" else None
+
+
+def shading(settings: dict[str, Any]) -> str | None:
+    """Light of one bounce at every pixel."""
+    return f"{PUBLISHED}.shading" if settings["shading"]["method"] != "shared_paths" else None
+
+
+def second_look(settings: dict[str, Any]) -> str | None:
+    """The fusion of stage base, once more."""
+    return f"{PUBLISHED}.second_look" if base(settings) else None
+
+
+def affines(settings: dict[str, Any]) -> str | None:
+    """Another solver, or the materials of an earlier method."""
+    if settings["affines"]["model"] != "objects":
+        return "lab.baselines.stage"
+    return f"{PUBLISHED}.affines" if settings["affines"]["solver"] != "direct" else None

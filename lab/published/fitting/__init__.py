@@ -1,0 +1,1 @@
+"""The paper's optimiser of the materials, and its loss."""

@@ -1,0 +1,1 @@
+"""The paper's optimiser of the base texture, its loss, and its hash grid."""

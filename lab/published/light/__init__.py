@@ -1,0 +1,1 @@
+"""The paper's optimiser of the emitters, its loss, and light of one bounce."""

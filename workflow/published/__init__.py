@@ -1,1 +1,0 @@
-"""Stages as the published method has them, to compare with (lab/docs/published.md)."""
