@@ -138,7 +138,7 @@ class StubJob:
     def __init__(self, stage: str, folder: Path, settings: dict[str, Any], seed: int = 0):
         self.stage, self.folder, self.seed, self.threads, self.scene = STAGES.get(stage), folder, seed, 2, "room"
         self.document = {"seed": seed}
-        known = {"prior": {"kind": "simulated"}, "components": SimpleNamespace(metallic="auto"), "materials": {}}
+        known = {"prior": {"kind": "simulated"}, "components": {"metallic": "auto"}, "materials": {}}
         known |= {"segmentation": {"kind": "given"}} | settings
         self.settings = SimpleNamespace(**{k: SimpleNamespace(**v) for k, v in known.items()})
         self.log = logging.getLogger(stage)
