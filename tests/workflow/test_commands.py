@@ -54,7 +54,7 @@ def copy_of(repository, checkout):
     """What of a checkout is needed to run."""
     checkout.mkdir()
     shutil.copy(repository / "Snakefile", checkout)
-    for part in ("config", "examples", "iif_core", "profiles", "workflow"):
+    for part in ("config", "examples", "iif_core", "lab", "profiles", "workflow"):
         shutil.copytree(repository / part, checkout / part, ignore=shutil.ignore_patterns("__pycache__"))
     return checkout
 

@@ -319,7 +319,7 @@ def test_known_scale_of_a_lamp_and_of_a_patch(hdr):
 
 
 PLANNED = {
-    "components": SimpleNamespace(specular="auto", metallic="auto"),
+    "components": {"specular": "auto", "metallic": "auto"},
     "emission": {**EMISSION, "environment": "auto", "saturation": 0.99},
     "shading": SHADING,
 }
