@@ -33,10 +33,20 @@ COSTS = {
     "relit_scores": "lab.work:relit_scores",
 }
 SCENES = "lab/config/scenes"
+QUALITY = "lab/config/quality"
 
-# ------------------------------------------------------------------------------ the published method and baselines
+# ------------------------------- the published method and baselines, and settings that the product holds constant
 
 SECTIONS = {
+    "capture": "lab.settings.capture:Capture",
+    "prior.learned": "lab.settings.prior:LearnedPrior",
+    "prior.retinex": "lab.settings.prior:RetinexPrior",
+    "prior.files": "lab.settings.prior:FilesPrior",
+    "prior.rgbx": "lab.settings.prior:RgbxPrior",
+    "prior.marigold": "lab.settings.prior:MarigoldPrior",
+    "prior.pooled": "lab.settings.pooled:PooledPrior",
+    "segmentation.given": "lab.settings.segmentation:GivenSegmentation",
+    "segmentation.geometry": "lab.settings.segmentation:GeometrySegmentation",
     "base": "lab.settings.methods:Base",
     "emission": "lab.settings.methods:Emission",
     "shading": "lab.settings.methods:Shading",

@@ -4,13 +4,15 @@ The environment variable IIF_PLUGINS names modules in packages of this checkout,
 holds nothing but names, so that it imports nothing, and defines any of
 
     KINDS    section (`source`, `prior`, `segmentation`) -> kind -> (module that implements it, class of its settings)
-    SECTIONS section of the settings (`scene`: all of them) -> subclass that adds fields, each with a default
+    SECTIONS section of the settings (`segmentation.geometry`: of one kind; `scene`: all of them) -> subclass that adds fields,
+             each with a default
     STAGES   stage -> function of the dumped settings -> name of the module whose `run(job)` takes the stage's place, or None
     READS    stage -> dotted settings that such a module reads in addition to those in `workflow/registry.py`
     ADDED    stage that is made on demand -> the arguments of its `Stage`
     SIZES    kind of source that is rendered -> function of its settings and of the faces of its mesh files -> faces
     COSTS    such a kind, or an added stage -> function of settings and size -> kind and counts (workflow/costs/work.py)
     SCENES   folder of the checkout with further scene files
+    QUALITY  folder of the checkout with settings that lie under those of the quality of the same name
 
 Classes and functions are written `package.module:name`. The settings of the product read the classes while they are imported
 themselves. So a module that holds such classes lies in a package whose `__init__` imports `workflow.settings`; it imports modules
@@ -26,7 +28,7 @@ from functools import lru_cache, reduce
 from operator import or_
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, get_args
 
 from iif_core.errors import InputError
 
@@ -74,9 +76,11 @@ def function(table: str, name: str) -> Callable[..., Any] | None:
 
 
 def union(section: str, *own: type) -> Any:
-    """Return the union of the classes of settings of a section: the product's, and those of the kinds that plug-ins add."""
+    """Return the union of the classes of settings of a section: the product's, or the subclasses that plug-ins put in their
+    place, and those of the kinds that plug-ins add."""
+    ours = [extended(f"{section}.{get_args(one.model_fields['kind'].annotation)[0]}", one) for one in own]
     added = [_load(settings) for name, kinds in _entries("KINDS") if name == section for _, settings in kinds.values()]
-    return reduce(or_, [*own, *added])
+    return reduce(or_, [*ours, *added])
 
 
 def implementation(section: str, kind: str) -> str:
@@ -108,6 +112,11 @@ def reads(stage: str) -> tuple[str, ...]:
 def scene_folders() -> list[str]:
     """Return the folders of the checkout, relative to it, in which plug-ins have scene files."""
     return [module.SCENES for module in modules() if hasattr(module, "SCENES")]
+
+
+def quality_folders() -> list[str]:
+    """Return the folders of the checkout, relative to it, in which plug-ins have settings for qualities."""
+    return [module.QUALITY for module in modules() if hasattr(module, "QUALITY")]
 
 
 def added_stages() -> dict[str, dict[str, Any]]:

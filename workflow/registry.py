@@ -80,7 +80,6 @@ STAGES: dict[str, Stage] = {
             (
                 "components.specular",
                 "emission.environment",
-                "emission.saturation",
                 "segmentation.kind",
                 "seed",
             ),
@@ -140,7 +139,6 @@ STAGES: dict[str, Stage] = {
             (
                 "affines",
                 "capture.dynamic_range",
-                "emission.saturation",
                 "components.metallic",
                 "materials",
                 "prior.kind",

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from iif_core.camera.response import SATURATION
 from iif_core.errors import InputError
 from iif_core.numerics.frames import dominant_side
 from iif_core.surface.cells import INDEX_LIMIT, pack_keys, voxel_indices
@@ -76,7 +77,7 @@ def patch_rows(
     block: np.ndarray,
     value: np.ndarray,
     view: int,
-    saturation: float = 0.99,
+    saturation: float = SATURATION,
     min_pixels: int = 4,
     evenness: float = 0.05,
     share: float = 1.0,

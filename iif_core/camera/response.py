@@ -25,6 +25,8 @@ START: dict[str, tuple[float, ...]] = {
     "sampled": (),
 }
 """Starting parameters, near sRGB."""
+SATURATION = 0.99
+"""Sensor value from which a pixel counts as saturated."""
 SPLINE_BINS = (2, 8)
 """Smallest and largest number of bins K of a spline, which has 2 K parameters; 3 by default."""
 _SPLINE_POWER = 0.45

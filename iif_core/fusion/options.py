@@ -1,4 +1,4 @@
-"""Options of the direct solver; their defaults are those of the settings of section `base`."""
+"""Options of the fusion: what is fused, and how the direct solver solves."""
 
 from __future__ import annotations
 
@@ -8,6 +8,24 @@ from dataclasses import dataclass
 from numpy.typing import NDArray
 
 from iif_core.numerics import laplace
+
+
+@dataclass(frozen=True)
+class CellOptions:
+    """How predictions are put on surface cells.
+
+    Attributes:
+        predictions: only the first so many of each view; None = all.
+        cell_edge: edge of a cell in m; None = `cell_footprints` median pixel footprints.
+        border_weight: weight of pixels next to another object: real predictions bleed across borders.
+        footprint_power: pixels weigh (median footprint / own footprint) to this power, which prefers near and frontal views.
+    """
+
+    predictions: int | None = None
+    cell_edge: float | None = None
+    cell_footprints: float = 0.4
+    border_weight: float = 0.1
+    footprint_power: float = 0.0
 
 
 @dataclass(frozen=True)

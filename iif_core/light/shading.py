@@ -13,6 +13,7 @@ import numpy as np
 
 from iif_core.camera.pixels import ViewPixels
 from iif_core.light.base_scene import BaseScene
+from iif_core.light.options import SEEDS, ShadingOptions
 from iif_core.reflectance.directional_albedo import uniform_lobes
 from iif_core.surface.shading_cells import DiffuseShading, ShadingCellBuilder, ShadingCells, combine_estimates, diffuse_of_cells
 
@@ -21,32 +22,8 @@ if TYPE_CHECKING:
     from iif_core.light.transport.geometry import Geometry
     from iif_core.light.transport.scene import Scene
 
-SEEDS = 0x736861  # keeps these random streams apart from those of other stages
 LEAST_CELLS = 20  # of an object whose predictions speak for or against specular lobes
 COVERAGE_RAYS = 8192  # by which the share of surface that the radiance cache knows is measured
-
-
-@dataclass(frozen=True)
-class ShadingOptions:
-    """How much light is traced.
-
-    Attributes:
-        seed: of the random streams.
-        samples: paths of a pixel, over two halves, and of a cell to begin with.
-        noise: relative error of diffuse light (median over an object) below which no more paths are added to cells.
-        max_samples: largest number of paths of a cell.
-        max_bounces: longest path.
-    """
-
-    seed: int
-    samples: int
-    noise: float
-    max_samples: int
-    max_bounces: int
-
-    def of_view(self, view_id: int) -> int:
-        """Return the seed of a view."""
-        return ((self.seed << 32) | SEEDS) << 32 | view_id
 
 
 @dataclass(frozen=True)

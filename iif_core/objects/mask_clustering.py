@@ -17,6 +17,7 @@ from iif_core.camera.pinhole import project
 from iif_core.errors import InputError
 from iif_core.numerics.arrays import numbered_by_first
 from iif_core.numerics.graph import component_labels
+from iif_core.objects.options import ConsensusOptions
 
 Array = np.ndarray
 
@@ -34,25 +35,6 @@ MIN_OBSERVERS = 2
 
 PERCENTILES = tuple(range(95, -1, -5))
 """Percentiles of the number of observers, over all pairs with a supporter, that are required step by step."""
-
-
-@dataclass(frozen=True)
-class ConsensusOptions:
-    """Thresholds of the clustering; shares in (0, 1].
-
-    Attributes:
-        visible: share of a mask that a view must see (Eq. O.8).
-        contained: share of the points that one mask must hold to contain them (Eq. O.9).
-        split: share of the views that can judge a mask above which a split mask is dropped (Eq. O.10).
-        consensus: smallest ratio of supporters to observers (Eq. O.11).
-        min_points: masks of fewer points are ignored.
-    """
-
-    visible: float = 0.3
-    contained: float = 0.8
-    split: float = 0.5
-    consensus: float = 0.9
-    min_points: int = 4
 
 
 def flatten_masks(masks: Sequence[Array]) -> Array:

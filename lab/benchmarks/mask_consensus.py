@@ -21,7 +21,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from iif_core.objects.mask_clustering import ConsensusOptions
+from iif_core.objects.options import ConsensusOptions, PieceOptions
 from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
 from iif_core.surface.segments import partition_agreement
 from tests.unit.spoilt_masks import purity, spoil_masks
@@ -31,7 +31,6 @@ from workflow.scene.normal_form import CaptureReader
 from workflow.segmentations import masks
 from workflow.segmentations.geometry import pieces
 from workflow.segmentations.surface import Surface
-from workflow.settings.segmentation import MaskSegmentation
 
 
 def spread_faces(surface: Surface, edge: float) -> np.ndarray:
@@ -49,7 +48,7 @@ def spread_faces(surface: Surface, edge: float) -> np.ndarray:
 def measure(folder: Path, seed: int, split: float, merge: float) -> dict[str, float | int | str]:
     """One row: a scene, a seed."""
     capture = CaptureReader(StageReader(folder, "capture", folder.parent.name))
-    surface, own = Surface(capture), MaskSegmentation(kind="masks")
+    surface = Surface(capture)
     instance, pixels = capture.faces()["instance_id"], surface.pixels()
     thing = np.unique(instance, return_inverse=True)[1]
     rng, labels, parts = np.random.default_rng(seed), {}, []
@@ -58,10 +57,9 @@ def measure(folder: Path, seed: int, split: float, merge: float) -> dict[str, fl
         labels[view.name] = spoil_masks(np.where(face >= 0, instance[face], -1), rng, split, merge)
         parts.append(len(np.unique(labels[view.name])) - 1)
     start = time.process_time()
-    piece = pieces(surface, own)
+    piece = pieces(surface, PieceOptions(min_faces=masks.MIN_FACES))
     middle = time.process_time()
-    options = ConsensusOptions(own.visible, own.contained, own.split, own.consensus, own.min_points)
-    found = masks.cluster_views(surface, surface.views(), lambda view: labels[view.name], options, piece)
+    found = masks.cluster_views(surface, surface.views(), lambda view: labels[view.name], ConsensusOptions(), piece)
     end = time.process_time()
     seen = pixels > 0
     vertex, corner = np.unique(surface.faces[seen].ravel(), return_index=True)

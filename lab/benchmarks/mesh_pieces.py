@@ -18,12 +18,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
+from iif_core.objects.options import PieceOptions
 from tests.unit.spoilt_masks import purity
 from workflow.artifacts import StageReader
 from workflow.scene.normal_form import CaptureReader
 from workflow.segmentations.geometry import pieces
 from workflow.segmentations.surface import Surface
-from workflow.settings.segmentation import GeometrySegmentation
 
 
 def measure(folder: Path, areas: list[float]) -> None:
@@ -34,9 +34,8 @@ def measure(folder: Path, areas: list[float]) -> None:
     seen = pixels > 0
     thing = np.unique(capture.faces()["instance_id"], return_inverse=True)[1][seen]
     for area in areas:
-        own = GeometrySegmentation(kind="geometry").model_copy(update={"min_area": area})
         start = time.process_time()
-        piece = pieces(surface, own)[seen]
+        piece = pieces(surface, PieceOptions(min_area=area))[seen]
         seconds = time.process_time() - start
         pure, complete = purity(piece, thing, pixels[seen])
         print(

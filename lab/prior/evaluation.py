@@ -146,7 +146,7 @@ def _truth(capture: Capture | CaptureReader, view: View) -> tuple[dict[str, np.n
 def _retinex(capture: Capture | CaptureReader, given: bool, seed: int) -> Callable[[View], np.ndarray]:
     from workflow.priors import predictor
 
-    own = SimpleNamespace(kind="retinex", samples=8, mean_albedo=0.4)
+    own = SimpleNamespace(kind="retinex", samples=8)
     settings = SimpleNamespace(prior=own, segmentation=SimpleNamespace(kind="given" if given else "geometry"))
     predict = predictor(settings, capture, seed, lambda array: array)  # type: ignore[arg-type]
     return lambda view: predict(view).maps

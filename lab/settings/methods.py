@@ -1,12 +1,18 @@
-"""Sections with settings that choose the published method, its optimisers, variants of ours, and baselines."""
+"""Sections with settings that choose the published method, its optimisers, variants of ours, and baselines, and with what the
+product holds constant and studies change."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from iif_core.fitting.problem import FitOptions
+from iif_core.fusion.options import CellOptions, FusionOptions
+from iif_core.light.emission.options import EmissionOptions
+from iif_core.light.options import ShadingOptions
 from workflow.settings import affines, base, light
+from workflow.settings.section import word_or_count
 
 PUBLISHED = ("published", "published_repaired")
 """Solvers of stage emission that are the published method from the photographs on."""
@@ -41,6 +47,28 @@ class Base(base.Base):
     """`sgd`: follow the derivative of the median over the predictions; default: no, `preset: paper` yes."""
     judge: bool = False
     """Evaluate the paper's loss of the result, and for `sgd` also the loss of `direct` at the same selection (base.json)."""
+    predictions: int | None = Field(CellOptions.predictions, ge=1)
+    """Use only the first so many predictions of each view; default: all."""
+    cell_edge: float | None = Field(CellOptions.cell_edge, gt=0)
+    """Edge of a surface cell in metres; default: `cell_footprints` pixel footprints."""
+    border_weight: float = Field(CellOptions.border_weight, gt=0, le=1)
+    """Weight of pixels next to another object."""
+    footprint_power: float = Field(CellOptions.footprint_power, ge=0, le=4)
+    """Weight pixels by (median footprint / own footprint) to this power."""
+    robust: bool = FusionOptions.robust
+    """Cells take an M-estimate instead of the mean."""
+    sweeps: int = Field(FusionOptions.sweeps, ge=1, le=200)
+    """Alternations."""
+    ridge: float = Field(FusionOptions.ridge, gt=0)
+    """Strength of the ridge of the affine maps towards the identity, per pixel."""
+    temperature: float = Field(FusionOptions.temperature, ge=0)
+    """Selection temperature of the first sweep, in units of a segment's median error."""
+    anneal: float = Field(FusionOptions.anneal, gt=0, lt=1)
+    """Factor on the selection temperature per sweep."""
+    final_temperature: float = Field(FusionOptions.final_temperature, ge=0)
+    """Temperature at which annealing stops; 0 = the single best prediction, more = near-ties are averaged."""
+    seams: bool = FusionOptions.seams
+    """Close seams between parts of an object that no photograph shows together."""
 
     @model_validator(mode="after")
     def _known_pairs(self) -> Base:
@@ -61,6 +89,8 @@ class Emission(light.Emission):
     (lab/docs/published.md#emission)."""
     iterations: int | None = Field(None, ge=1)
     """`published`: steps of 8192 pixels each; default: one pass over all pixels."""
+    cache_edge: float = Field(EmissionOptions.cache_edge, gt=0)
+    """Edge of a radiance-cache voxel in metres."""
 
 
 class Shading(light.Shading):
@@ -70,6 +100,13 @@ class Shading(light.Shading):
     """`shared_paths`: all lobes from one set of paths, diffuse light once for every surface cell; `published`: as the paper has
     it, at every pixel 256 paths for diffuse light and 64 to 128 for each of 6 levels, of one bounce, and the denoiser
     (lab/docs/published.md#shading)."""
+    pixels: Annotated[Literal["auto", "all"] | Annotated[int, Field(ge=100)], word_or_count("auto", "all", least=100)] = "auto"
+    """Pixels of which specular light is traced, drawn evenly over the objects. `auto`: as many as the fit reads
+    (`affines.pixels`), or `all` where it reads every pixel. A number must be at least `affines.pixels`."""
+    cell_edge: float = Field(ShadingOptions.cell_edge, gt=0)
+    """Edge in metres of the surface cells for which diffuse light is cached, once for all views."""
+    max_samples: int = Field(ShadingOptions.max_samples, ge=2)
+    """Largest number of paths per cell."""
 
 
 class Affines(affines.Affines):
@@ -89,6 +126,17 @@ class Affines(affines.Affines):
     """`sgd`, `adam`, `published`: pixels in one step."""
     rate: float | None = Field(None, gt=0)
     """`sgd`, `adam`, `published`: step size; the default is 10, and 0.01 for `adam`."""
+    iterations: int = Field(FitOptions.iterations, ge=1, le=500)
+    """`direct`: largest number of Gauss-Newton steps; the fit ends earlier when a step changes nothing."""
+    population: bool = FitOptions.population
+    """The prior of every object is the distribution of the well-determined objects of the scene (empirical Bayes);
+    `false`: a fixed, weak prior."""
+    robust_width: float = Field(FitOptions.robust_width, gt=0)
+    """Width of the Cauchy loss of the residual, in sensor units."""
+    texture: Literal["auto", "base", "photographs"] = "auto"
+    """Albedo of the surface cells. `base`: the base texture under the affine maps; `photographs`: the same, plus the
+    detail that the photographs show in each cell, without slow changes across an object; `auto`: `photographs` for
+    `prior: {kind: retinex}`, `base` otherwise."""
 
     @model_validator(mode="after")
     def _known_pairs(self) -> Affines:
@@ -97,6 +145,10 @@ class Affines(affines.Affines):
         if self.solver not in solvers:
             raise ValueError(f"`solver: {self.solver}` does not fit `model: {self.model}`; allowed with it: {', '.join(solvers)}")
         return self
+
+    def textured(self, prior_kind: str) -> bool:
+        """Return whether surface cells take the detail that the photographs show in them."""
+        return super().textured(prior_kind) if self.texture == "auto" else self.texture == "photographs"
 
     def of_cells(self, prior_kind: str) -> str:
         """Return what gives surface cells materials of their own, in words; empty if nothing does."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pydantic import Field, model_validator
 
 from lab.settings.methods import PUBLISHED
+from workflow.settings.prior import predictions
 from workflow.settings.scene import SceneSettings
 from workflow.settings.section import Section
 
@@ -34,6 +37,35 @@ class LabScene(SceneSettings):
     """The settings of the product, those of scored relighting, and what must hold where another method than ours is chosen."""
 
     relit: Relit = Relit()
+
+    @model_validator(mode="after")
+    def _known_predictions(self) -> LabScene:
+        made, used = predictions(self.prior.model_dump()), self.base.predictions
+        if used is not None and used > made:
+            raise ValueError(
+                f"`base: predictions` is {used}, but `prior` makes {made} (`samples`); lower the one or raise the other"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _enough_pixels(self) -> LabScene:
+        asked, needed = self.shading.pixels, super().implied()["shading"]["pixels"]
+        if isinstance(asked, int) and (needed == "all" or asked < needed):
+            cells = self.affines.of_cells(self.prior.kind)
+            why = (
+                f"{cells or '`affines: pixels: all`'} reads every pixel"
+                if needed == "all"
+                else f"the fit reads {needed} (`affines: pixels`)"
+            )
+            raise ValueError(f"`shading: pixels` is {asked}, but {why}; write `auto`, or at least `{needed}`")
+        return self
+
+    def implied(self) -> dict[str, dict[str, Any]]:
+        """Return what other settings decide, where no setting of the laboratory does."""
+        found = super().implied()
+        if self.shading.pixels != "auto":
+            found["shading"]["pixels"] = self.shading.pixels
+        return found
 
     @model_validator(mode="after")
     def _published_photographs(self) -> LabScene:

@@ -6,10 +6,17 @@ The cost of a job is a sum over these counts, with factors that are fitted to fi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple, TypeVar
 
+from iif_core.fusion.options import CellOptions
+from iif_core.light.emission.options import EmissionOptions
+from iif_core.light.options import ShadingOptions
 from workflow import plugins
+from workflow.settings.options import options_of
 from workflow.settings.prior import members, predictions
+
+Options = TypeVar("Options")
 
 MILLION = 1e6
 PROBED_VIEWS = 32
@@ -83,9 +90,13 @@ def _segmentation(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[
     return settings["segmentation"]["kind"], {"pixels": size.pixels / MILLION, "faces": size.faces / MILLION}
 
 
+def _options(options: type[Options], section: dict[str, Any], **given: Any) -> Options:
+    return options_of(options, SimpleNamespace(**section), **given)
+
+
 def _base(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     base, pixels, faces = settings["base"], size.pixels / MILLION, size.faces / MILLION
-    fused = pixels * min(base["predictions"] or 1 << 30, predictions(settings["prior"]))
+    fused = pixels * min(_options(CellOptions, base).predictions or 1 << 30, predictions(settings["prior"]))
     return "direct", {"predictions": fused, "pixels": pixels, "faces": faces, "cells": _base_cells(settings, size)}
 
 
@@ -106,7 +117,7 @@ def _common_scores(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict
 def _emission(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     emission, faces = settings["emission"], size.faces / MILLION
     rows = min(emission["rows"], size.pixels) / MILLION
-    seen = min(emission["pixels"], size.pixels) / MILLION
+    seen = min(_options(EmissionOptions, emission, seed=0).pixels, size.pixels) / MILLION
     return "direct", {
         "rows": rows,
         "paths": rows * emission["samples"],
@@ -119,13 +130,13 @@ def _emission(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str,
 def _shading(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     shading, pixels, faces = settings["shading"], size.pixels / MILLION, size.faces / MILLION
     traced = pixels if shading["pixels"] == "all" else min(shading["pixels"] / MILLION, pixels)
-    cells = 1 / shading["cell_edge"] ** 2 / MILLION  # a square metre
-    noise = shading["noise"] if isinstance(shading["noise"], int | float) else 0.2
+    options = _options(ShadingOptions, shading, seed=0)
+    cells = 1 / options.cell_edge**2 / MILLION  # a square metre
     return "shared_paths", {
         "specular": traced * shading["samples"],
         "written": traced * shading["levels"],
         "diffuse": cells * shading["samples"],
-        "adaptive": cells * min(noise**-2, shading["max_samples"]),
+        "adaptive": cells * min(options.noise**-2, options.max_samples),
         "pixels": pixels,
         "faces": faces,
     }

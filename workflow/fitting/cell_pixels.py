@@ -64,7 +64,7 @@ class CellPixels:
                 specular = read_specular(job, view).at(pixels.index)
                 s0, s1, d = specular.s0.mean(0), specular.s1.mean(0), diffuse[block]
             value = np.asarray(pixels.value, np.float32)
-            value, saturated = sensor_bounds(value, capture.is_hdr, job.settings.emission.saturation)
+            value, saturated = sensor_bounds(value, capture.is_hdr)
             exposure, balance = exposure_and_balance(capture, gains, view, pixels.index)
             if diffuse is not None:  # blocks average light before the white balance of a photograph
                 d = balanced(d, balance)

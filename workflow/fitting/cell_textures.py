@@ -16,7 +16,6 @@ from workflow.fitting.cell_pixels import CellPixels
 from workflow.fitting.inputs import roughness_levels
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader
-from workflow.settings.affines import textures_cells
 
 
 def _points(job: Job) -> np.ndarray:
@@ -36,9 +35,9 @@ class CellTextures:
 
     @classmethod
     def of(cls, job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray) -> CellTextures | None:
-        """Read them, or return None where `affines.texture` does not ask for them; `mixed` as in `CellPixels`."""
+        """Read them, or return None where the settings do not ask for them; `mixed` as in `CellPixels`."""
         cells = len(scene.cell_object)
-        if not textures_cells(job.settings.affines.texture, job.settings.prior.kind) or not cells:
+        if not job.settings.affines.textured or not cells:
             return None
         views = CellPixels(job, capture, scene, mixed, np.arange(cells), cells)
         views.diffuse = smooth_light(views.diffuse, _points(job), scene.cell_object)

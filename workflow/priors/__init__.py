@@ -57,6 +57,12 @@ def members(prior: SimpleNamespace) -> list[SimpleNamespace]:
     return [SimpleNamespace(**own) for own in prior.of] if hasattr(prior, "of") else [prior]
 
 
+def seed_of(prior: SimpleNamespace, seed: int) -> int:
+    """Return the seed of the predictions of a prior: its own, where a plug-in gives it one, or that of the scene."""
+    own = getattr(prior, "seed", None)
+    return seed if own is None else own
+
+
 def predictor(
     settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep, threads: int = 1
 ) -> Callable[[View], Predicted]:

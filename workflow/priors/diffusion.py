@@ -19,8 +19,10 @@ import torch
 from torch.nn.functional import interpolate
 
 from iif_core.errors import InputError
+from iif_core.priors.options import SamplingOptions
 from workflow.models.checkpoint import PACKAGES, Checkpoint, Recipe, check
 from workflow.models.loading import deterministic, load_network, named_device, quiet
+from workflow.settings.options import options_of
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
 OVERLAP = 0.25  # share of a tile that the next one repeats, as AutoencoderKL has it for its own tiles
@@ -112,8 +114,9 @@ class Model:
     def __init__(self, recipe: Recipe, prior: SimpleNamespace):
         """Load the model of the settings section `prior`, whose checkpoint is checked again."""
         self.recipe, self.checkpoint = recipe, check(vars(prior), recipe)
+        options = options_of(SamplingOptions, prior)
         self.device = named_device(prior.device, recipe)
-        self.dtype = _precision(prior.precision, self.device)
+        self.dtype = _precision(options.precision, self.device)
         self.workers = 1 if self.device.type == "cuda" else torch.get_num_threads()
         self.batch = prior.batch or (1 if self.device.type == "cpu" else 4)
         with quiet("diffusers", "transformers"):
@@ -126,7 +129,7 @@ class Model:
             self.text = [text.to(self.device, self.dtype) for text in _embeddings(self.checkpoint, recipe)]
         self.reduction = 2 ** (len(self.vae.config.block_out_channels) - 1)
         self.multiple = self.reduction * 2 ** (len(self.unet.config.block_out_channels) - 1)
-        self.tile = max(prior.tile // self.multiple, 1) * self.multiple
+        self.tile = max(options.tile // self.multiple, 1) * self.multiple
         self.vae.enable_slicing()
         self.vae.enable_tiling()  # of pictures larger than a tile
         self.vae.tile_sample_min_size, self.vae.tile_latent_min_size = self.tile, self.tile // self.reduction
@@ -212,7 +215,7 @@ def predict_maps(recipe: Recipe, prior: SimpleNamespace, photo: np.ndarray, long
     except torch.OutOfMemoryError:
         raise InputError(
             f"the GPU's memory does not hold {model.batch} samples of {wide}x{high} at once: lower `prior.batch`,"
-            " then `prior.tile`, then `prior.longest_side`"
+            " or set `prior.device: cpu`"
         ) from None
     # The weights of the filter sum to up to 1 + 1e-7; NaN stays.
     flat = np.clip(resize(maps.reshape(-1, high, wide, 3), width, height), 0, 1)

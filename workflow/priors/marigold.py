@@ -14,8 +14,10 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.numerics.color import linear_from_srgb
+from iif_core.priors.options import SamplingOptions
 from workflow.models.checkpoint import Recipe, check
 from workflow.scene.normal_form import CaptureReader, View
+from workflow.settings.options import options_of
 
 REPOSITORY = "prs-eth/marigold-iid-appearance-v1-1"
 MAPS = {"albedo": 3, "roughness": 1, "metallicity": 1}  # the checkpoint's name of each map, and its channels
@@ -99,7 +101,7 @@ def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed:
     prior = settings.prior
     index = check(vars(prior), RECIPE).index
     steps = prior.steps or index.get("default_denoising_steps") or STEPS
-    longest = prior.longest_side or index.get("default_processing_resolution") or LONGEST_SIDE
+    longest = options_of(SamplingOptions, prior).longest_side or index.get("default_processing_resolution") or LONGEST_SIDE
     found = predict_maps(RECIPE, prior, picture_for_model(view, capture, linear=False), longest, steps, seed)
     maps = []
     for position, channels, space in layout(index).values():

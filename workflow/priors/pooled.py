@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from workflow import plugins
-from workflow.priors import Keep, Predicted, members, predictor
+from workflow.priors import Keep, Predicted, members, predictor, seed_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -51,7 +51,7 @@ class Pool:
 
     def __init__(self, settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep, threads: int = 1):
         self._members = [
-            predictor(member_settings(settings, own), capture, seed if own.seed is None else own.seed, keep, threads)
+            predictor(member_settings(settings, own), capture, seed_of(own, seed), keep, threads)
             for own in members(settings.prior)
         ]
         self.concurrent = all(getattr(one, "concurrent", False) for one in self._members)

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from iif_core.errors import InputError
-from iif_core.priors.features import REACHES, scene_light
+from iif_core.priors.features import MEAN_ALBEDO, REACHES, scene_light
 from iif_core.priors.retinex import retinex_predictions
 from workflow.priors import Keep, Predicted
 from workflow.priors.views import CaptureViews
@@ -25,7 +25,7 @@ class Retinex:
         self.views = CaptureViews(capture, settings.segmentation.kind == "given")
         self.views.calibrate()
         try:
-            self.light = scene_light(self.views, self.views.tracer(), self.settings.mean_albedo, seed)
+            self.light = scene_light(self.views, self.views.tracer(), MEAN_ALBEDO, seed)
         except InputError:  # no photograph shows the mesh: each is taken by itself
             self.light = None
 
@@ -43,7 +43,7 @@ class Retinex:
         maps = retinex_predictions(
             own.linear,
             self.settings.samples,
-            self.settings.mean_albedo,
+            MEAN_ALBEDO,
             own.group,
             own.normals,
             (own.used | ~hit.reshape(own.depth.shape)) & ~own.saturated,

@@ -12,9 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from iif_core.priors.options import SamplingOptions
 from workflow.models.checkpoint import Recipe, check
 from workflow.scene.normal_form import CaptureReader, View
+from workflow.settings.options import options_of
 
+LONGEST_SIDE = 1024
 RECIPE = Recipe(
     kind="rgbx",
     repository="zheng95z/rgb-to-x",
@@ -57,5 +60,6 @@ def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed:
     from workflow.scene.photograph import picture_for_model
 
     prior = settings.prior
-    maps = predict_maps(RECIPE, prior, picture_for_model(view, capture, linear=True), prior.longest_side, prior.steps, seed)
+    longest = options_of(SamplingOptions, prior).longest_side or LONGEST_SIDE
+    maps = predict_maps(RECIPE, prior, picture_for_model(view, capture, linear=True), longest, prior.steps, seed)
     return np.concatenate([maps[:, 0], maps[:, 1, ..., :1], maps[:, 2, ..., :1]], -1)

@@ -44,7 +44,7 @@ def page_that_fits(
             return page, shown
     raise InputError(
         f"room.max_mb: the page has {len(page) / 1e6:.1f} MB without photographs, and {allowed:g} MB are allowed;"
-        " raise room.max_mb, or lower room.texture_size, room.lightmap_size or export.max_faces_glb"
+        " raise room.max_mb, or lower room.lightmap_size or export.max_faces_glb"
     )
 
 

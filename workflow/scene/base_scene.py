@@ -9,6 +9,7 @@ import numpy as np
 
 from iif_core.camera.gains import CameraGains
 from iif_core.camera.pixels import ViewPixels
+from iif_core.camera.response import SATURATION
 from iif_core.light.base_scene import BaseScene, Light
 from iif_core.reflectance.material import CHANNELS, NEUTRAL
 from iif_core.surface.triangles import face_geometry
@@ -66,14 +67,14 @@ def _rows(table: dict[str, np.ndarray]) -> np.ndarray:
     return np.stack([table[name] for name in CHANNELS], 1).astype(np.float32)
 
 
-def sensor_bounds(value: np.ndarray, is_hdr: bool, saturation: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return sensor values limited to `saturation`, and a mask of those that are at it and thus only lower bounds.
+def sensor_bounds(value: np.ndarray, is_hdr: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return sensor values limited to SATURATION, and a mask of those that are at it and thus only lower bounds.
 
     Radiance (`is_hdr`) has no upper limit and no bounds.
     """
     if is_hdr:
         return value, np.zeros(value.shape, bool)
-    return np.minimum(value, saturation), value >= saturation
+    return np.minimum(value, SATURATION), value >= SATURATION
 
 
 def view_pixels(job: Job, capture: CaptureReader, scene: BaseScene, view: View) -> ViewPixels:

@@ -20,15 +20,15 @@ VIEW_MEMORY_MB = 1024.0
 class ViewRecords:
     """Records of views, read from disk once as far as they fit into VIEW_MEMORY_MB.
 
-    Where the photographs have more pixels than `emission.pixels`, a record is of a random choice of those of its view, the same
+    Where the photographs have more pixels than `most` in all, a record is of a random choice of those of its view, the same
     share of every view; nothing but `seen` and `median_depth` is then of the whole view.
 
     Passes visit the views in the same order, so the first views are kept and the later ones are decoded again.
     """
 
-    def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene):
+    def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene, most: int):
         self.job, self.scene, self.views = job, scene, DecodedViews(capture, job.read("segmentation"), 0)
-        self.share = min(1.0, job.settings.emission.pixels / max(sum(view.width * view.height for view in capture.used), 1))
+        self.share = min(1.0, most / max(sum(view.width * view.height for view in capture.used), 1))
         self._kept: dict[int, ViewRecord] = {}
         self._megabytes = 0.0
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from iif_core.errors import InputError
+from iif_core.fusion.options import CellOptions
 from iif_core.fusion.pixels import pixel_weights, relative_footprints, surface_tangents
 from iif_core.surface.cell_grid import CellGrid, build_cell_grid, median_footprint, smallest_edge
 from iif_core.surface.triangles import face_geometry
@@ -24,16 +25,16 @@ def on_surface(decoded: DecodedViews, view: View) -> tuple[np.ndarray, np.ndarra
     return index, points, object_id.ravel()[index]
 
 
-def cells_of_views(job: Job, decoded: DecodedViews, views: list[View]) -> tuple[CellGrid, list[np.ndarray]]:
+def cells_of_views(job: Job, options: CellOptions, decoded: DecodedViews, views: list[View]) -> tuple[CellGrid, list[np.ndarray]]:
     """The grid and the cell of every pixel, (H * W,) int32 per view with -1 = none."""
     vertices, faces = decoded.capture.mesh()
     corners = vertices[np.unique(faces)]
-    edge = job.settings.base.cell_edge
+    edge = options.cell_edge
     if edge is None:
         footprint = median_footprint(_seen_depths(decoded, views))
         if footprint is None:
             raise InputError("base: no pixel of any view with predictions sees the mesh; check the alignment of the capture")
-        edge = job.settings.base.cell_footprints * footprint
+        edge = options.cell_footprints * footprint
     smallest = smallest_edge(corners)
     if edge < smallest:
         extent = float(np.ptp(corners, axis=0).max())
@@ -64,18 +65,19 @@ def _seen_depths(decoded: DecodedViews, views: list[View]) -> Iterator[tuple[np.
         yield depth[(face_id >= 0) & (depth > 0)], view.fx
 
 
-def weights_and_segments(job: Job, decoded: DecodedViews, views: list[View]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def weights_and_segments(
+    options: CellOptions, decoded: DecodedViews, views: list[View]
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Weight and segment of every pixel of each view, flattened; pixels that the photograph does not show weigh 0."""
-    settings = job.settings.base
     weights, segments = [], []
     footprints = [None] * len(views)
-    if settings.footprint_power > 0:
+    if options.footprint_power > 0:
         pixels = _pixel_geometry(decoded, views)
         footprints = relative_footprints((*pixels(position), view.fx) for position, view in enumerate(views))
     for view, footprint in zip(views, footprints, strict=True):
         segmented, (_, valid) = decoded.segmented(view), decoded.capture.photo(view)
         weights.append(
-            pixel_weights(segmented.interior, valid, settings.border_weight, footprint, settings.footprint_power).ravel()
+            pixel_weights(segmented.interior, valid, options.border_weight, footprint, options.footprint_power).ravel()
         )
         segments.append(segmented.segment_id.ravel())
     return weights, segments

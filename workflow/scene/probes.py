@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from iif_core.camera.pinhole import project
+from iif_core.camera.response import SATURATION
 from iif_core.errors import InputError
 from iif_core.numerics.color import linear_from_srgb
 from iif_core.numerics.frames import dominant_side
@@ -59,7 +60,7 @@ class ViewRadiance:
     face: np.ndarray
 
 
-def read_radiance(capture: CaptureReader, view: View, saturation: float) -> ViewRadiance:
+def read_radiance(capture: CaptureReader, view: View) -> ViewRadiance:
     """Read a photograph; 8-bit values become radiance by the sRGB curve and the exposure, which no probe improves on."""
     value, valid = capture.photo(view)
     depth, face = capture.gbuffer(view)
@@ -67,7 +68,7 @@ def read_radiance(capture: CaptureReader, view: View, saturation: float) -> View
     if capture.is_hdr:
         return ViewRadiance(view, value / exposure, valid, np.zeros(valid.shape, bool), depth, face)
     radiance = linear_from_srgb(np.clip(value, 0, 1)).astype(np.float32) / exposure
-    return ViewRadiance(view, radiance, valid, valid & (value.max(-1) >= saturation), depth, face)
+    return ViewRadiance(view, radiance, valid, valid & (value.max(-1) >= SATURATION), depth, face)
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ class ProbeRows:
     outside: float | None
 
 
-def probe_rows(job: Job, capture: CaptureReader, geometry: Geometry, saturation: float) -> ProbeRows:
+def probe_rows(job: Job, capture: CaptureReader, geometry: Geometry) -> ProbeRows:
     """Draw the points and trace their rays.
 
     Raises:
@@ -138,7 +139,7 @@ def probe_rows(job: Job, capture: CaptureReader, geometry: Geometry, saturation:
     """
     rng = np.random.default_rng([job.seed, _SEEDS])
     views = capture.used[:: max(1, -(-len(capture.used) // MAX_VIEWS))]
-    photos = [read_radiance(capture, view, saturation) for view in views]
+    photos = [read_radiance(capture, view) for view in views]
     depth = np.concatenate([photo.depth[photo.usable & (photo.face >= 0)] for photo in photos])
     if not len(depth):
         raise InputError(

@@ -7,8 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 
 from iif_core.objects.felzenszwalb import segment_mesh, smooth_over_faces
+from iif_core.objects.options import PieceOptions
 from workflow.artifacts.store import StageReader
 from workflow.segmentations.surface import FOLDS, Objects, Surface
+from workflow.settings.options import options_of
 
 PERTURBED = "every third photograph's colours left out, `scale` times 1/sqrt(2), 1, sqrt(2)"
 
@@ -17,7 +19,7 @@ COLOUR_ROUNDS = 3  # steps across the mesh over which a face that no pixel sees 
 
 def segment(surface: Surface, settings: SimpleNamespace, fold: int | None = None) -> Objects:
     """Make every piece an object."""
-    labels = pieces(surface, settings.segmentation, fold)
+    labels = pieces(surface, options_of(PieceOptions, settings.segmentation), fold)
     names = [f"piece {i}" for i in range(int(labels.max()) + 1)]
     return Objects(labels, names, np.ones(len(names)), {})
 
@@ -27,7 +29,7 @@ def perturbs(surface: Surface) -> bool:
     return True
 
 
-def pieces(surface: Surface, own: SimpleNamespace, fold: int | None = None) -> np.ndarray:
+def pieces(surface: Surface, own: PieceOptions, fold: int | None = None) -> np.ndarray:
     """Return the piece of every face, (m,) int32 from 0; with `fold` as `PERTURBED` says."""
     scale = own.scale if fold is None else own.scale * 2 ** (0.5 * (fold - FOLDS // 2))
     colour = None

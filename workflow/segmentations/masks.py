@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
-from iif_core.objects.mask_clustering import ConsensusOptions, MaskPoints, cluster_masks, gather_masks, masks_at
+from iif_core.objects.mask_clustering import MaskPoints, cluster_masks, gather_masks, masks_at
 from iif_core.objects.mask_votes import join_objects, label_faces, merge_votes, part_objects, sightings, view_votes
+from iif_core.objects.options import ConsensusOptions, PieceOptions
 from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
 from iif_core.surface.segments import fill_within
 from workflow.runtime.job import Job
@@ -20,9 +21,11 @@ from workflow.segmentations import sam2
 from workflow.segmentations.geometry import pieces
 from workflow.segmentations.mask_files import MaskFiles, mask_files
 from workflow.segmentations.surface import Objects, Surface
+from workflow.settings.options import options_of
 
 PERTURBED = "every third photograph and its masks left out"
 
+MIN_FACES = 20  # of a piece of the mesh where there are no masks; smaller ones join a neighbour
 POINT_FOOTPRINTS = 2.0  # edge of the voxels that sample the surface, in median pixel footprints
 GAP, GAP_VOXELS = 0.1, 3.0
 """Parts of a cluster further apart than about this distance (metres, but at least that many voxels) are different objects."""
@@ -51,9 +54,9 @@ def segment(surface: Surface, settings: SimpleNamespace, fold: int | None = None
     """Make objects of the masks, and of pieces of the mesh where there are no masks."""
     own = settings.segmentation
     files = None if own.sam2 is not None else MaskFiles.of_capture(settings, surface.capture)
-    options = ConsensusOptions(own.visible, own.contained, own.split, own.consensus, own.min_points)
+    options = options_of(ConsensusOptions, own)
     if "piece" not in surface.kept:
-        surface.kept["piece"] = pieces(surface, own)
+        surface.kept["piece"] = pieces(surface, options_of(PieceOptions, own, min_faces=MIN_FACES))
     kept = surface.kept.setdefault("labels", {})
 
     def load(view: View) -> np.ndarray:
@@ -97,7 +100,7 @@ def cluster_views(surface: Surface, views: list[View], load: Load, options: Cons
     if not len(masks.view):
         raise InputError(
             f"`segmentation: {{kind: masks}}`: no mask of any view covers {options.min_points} surface points"
-            f" ({1000 * edge:.3g} mm apart); check that the files hold ids above 0, or lower `segmentation.min_points`"
+            f" ({1000 * edge:.3g} mm apart); check that the files hold ids above 0"
         )
     cluster = cluster_masks(masks, options)
 

@@ -16,6 +16,7 @@ import numpy as np
 from iif_core.errors import InputError
 from iif_core.objects.mask_clustering import flatten_masks
 from iif_core.objects.mask_proposals import point_grid, suppress_overlaps, threshold_stability
+from iif_core.objects.options import ProposalOptions
 from workflow.models.checkpoint import (
     Checkpoint,
     Origin,
@@ -30,6 +31,7 @@ from workflow.models.checkpoint import (
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.photograph import picture_for_model
+from workflow.settings.options import options_of
 
 ORIGIN = Origin(
     repository="facebook/sam2.1-hiera-large",
@@ -83,7 +85,7 @@ class Generator:
         """Load the model of the settings section `own`, whose checkpoint is checked again."""
         from workflow.models.loading import load_network, named_device, quiet
 
-        self.own, self.checkpoint = own, check(vars(own))
+        self.options, self.checkpoint = options_of(ProposalOptions, own), check(vars(own))
         self.device = named_device(own.device, ORIGIN)
         with quiet("transformers"):
             import torch
@@ -98,7 +100,7 @@ class Generator:
         With it come the number of masks that pass the thresholds, and the reason for missing masks.
         """
         masks, score, lost = self.proposals(picture)
-        kept = suppress_overlaps(masks, score, self.own.overlap)
+        kept = suppress_overlaps(masks, score, self.options.overlap)
         if not len(kept):
             wrong = f"{lost} answers are not finite" if lost else "no mask passed confidence and stability"
             return np.zeros(picture.shape[:2], np.int32), 0, wrong
@@ -112,7 +114,7 @@ class Generator:
         from workflow.models.loading import deterministic
 
         masks, scores, lost = [np.zeros((0, *picture.shape[:2]), bool)], [np.zeros(0, np.float32)], 0
-        points = torch.from_numpy(point_grid(self.own.points_per_side) * self.side).to(self.device)
+        points = torch.from_numpy(point_grid(self.options.points_per_side) * self.side).to(self.device)
         try:
             with deterministic(self.device):
                 embedding = self.model.get_image_embeddings(self._seen(picture))
@@ -125,7 +127,7 @@ class Generator:
                     logits, score = answer.pred_masks[0].flatten(0, 1), answer.iou_scores[0].flatten()
                     finite = score.isfinite() & logits.isfinite().all(-1).all(-1)
                     lost += int((~finite).sum())
-                    sure = finite & (score > self.own.confidence)
+                    sure = finite & (score > self.options.confidence)
                     if not sure.any():
                         continue
                     for part, its in zip(logits[sure].split(MASKS_AT_ONCE), score[sure].split(MASKS_AT_ONCE), strict=True):
@@ -154,7 +156,7 @@ class Generator:
 
         large = torch.nn.functional.interpolate(logits[None], shape, mode="bilinear")[0].cpu().numpy()
         masks = large > 0
-        return masks, (threshold_stability(large) >= self.own.stability) & masks.any((1, 2))
+        return masks, (threshold_stability(large) >= self.options.stability) & masks.any((1, 2))
 
 
 def label_maps(job: Job, capture: CaptureReader) -> dict[str, np.ndarray]:
@@ -181,7 +183,7 @@ def label_maps(job: Job, capture: CaptureReader) -> dict[str, np.ndarray]:
     ids, proposals, masks, wrong = (list(column) for column in zip(*rows, strict=True))
     if not any(masks):
         raise InputError(
-            f"SAM 2 found no mask in any of {len(views)} views ({wrong[0]}); lower `segmentation.sam2.confidence` or `stability`,"
+            f"SAM 2 found no mask in any of {len(views)} views ({wrong[0]}); lower `segmentation.sam2.confidence`,"
             " or check the checkpoint"
         )
     if any(wrong):

@@ -7,15 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from iif_core.fitting.problem import FitOptions
 from workflow.settings.section import Section, word_or_count
-
-_DEFAULT = FitOptions()
-
-
-def textures_cells(texture: str, prior_kind: str) -> bool:
-    """Return whether `affines.texture` asks for texture from the photographs, with the prior of a kind."""
-    return texture == "photographs" or (texture == "auto" and prior_kind == "retinex")
 
 
 class ResponseFile(Section):
@@ -86,27 +78,21 @@ class Affines(Section):
     """Family of the camera response, or `{file: curve.csv}` for a measured one (CSV or Parquet with columns `x, R, G, B`, or NPY
     of shape (3, samples)). `auto`: identity for HDR; for LDR the simplest of srgb, gamma, ggcm and spline that explains how
     photographs of different exposure show the same surface, and srgb where no surface is shown by several exposures."""
-    iterations: int = Field(_DEFAULT.iterations, ge=1, le=500)
-    """Largest number of Gauss-Newton steps; the fit ends earlier when a step changes nothing."""
     pixels: Annotated[Literal["all"] | Annotated[int, Field(ge=100)], word_or_count("all", least=100)] = 200000
     """Pixels in the fit, drawn evenly over the objects, or `all`."""
-    population: bool = _DEFAULT.population
-    """The prior of every object is the distribution of the well-determined objects of the scene (empirical Bayes);
-    `false`: a fixed, weak prior."""
-    robust_width: float = Field(_DEFAULT.robust_width, gt=0)
-    """Width of the Cauchy loss of the residual, in sensor units."""
     scale: Literal["found", "prior"] | KnownScale = "found"
     """What fixes the factor between light and albedo: `found`: the share of indirect light; `prior`: the prior's mean
     albedo (`found` for HDR); or a known quantity: {white_patch: {object: NAME, albedo: 0.9}}, {white_patch: {view:
     NAME, box: [left, top, right, bottom], albedo: 0.9}}, {lamp: {emitter_id: 0, radiance: [5, 5, 4]}}, {mean_albedo: 0.4}."""
-    texture: Literal["auto", "base", "photographs"] = "auto"
-    """Albedo of the surface cells. `base`: the base texture under the affine maps; `photographs`: the same, plus the
-    detail that the photographs show in each cell, without slow changes across an object; `auto`: `photographs` for
-    `prior: {kind: retinex}`, which was made before the light was known, `base` otherwise."""
+
+    def textured(self, prior_kind: str) -> bool:
+        """Return whether surface cells take the detail that the photographs show in them: with a prior, of a kind, that was made
+        before the light was known."""
+        return prior_kind == "retinex"
 
     def of_cells(self, prior_kind: str) -> str:
         """Return what gives surface cells materials of their own, for which every pixel is read, in words; empty if nothing does.
 
         prior_kind: `kind` of the prior.
         """
-        return "texture from the photographs" if textures_cells(self.texture, prior_kind) else ""
+        return "texture from the photographs" if self.textured(prior_kind) else ""

@@ -15,16 +15,16 @@ class Components(Section):
     """Parts of the model that are forced in (`on`) or out (`off`); `auto`: as the scene requires."""
 
     environment: Choice = "auto"
-    """Light from outside the mesh, as `emission: {environment: ...}`."""
+    """Light from outside the mesh: 42 directions, what is seen apart, or twelve where the mesh is open."""
     specular: Choice = "auto"
     """Specular lobes; without them nothing is metal, and re-renderings end in photographed
     radiance, if the radiance cache is in."""
     metallic: Annotated[Literal["auto", "off"], ON_OFF] = "auto"
     """The fit decides which objects are metals; `off`: every object is a dielectric."""
     radiance_cache: Choice = "auto"
-    """Indirect light from photographed surface, as `shading: {indirect: cache}`; `off` as `path`."""
+    """Indirect light. `on`: paths end at surface whose radiance was photographed; `off`: paths go on with the base materials."""
     denoiser: Choice = "auto"
-    """Denoised re-renderings; `off` as `render: {denoise: false}`."""
+    """Denoised re-renderings. They are looked at and compared; nothing is fitted to them."""
 
 
 class GivenMaterial(Section):

@@ -10,11 +10,13 @@ from typing import Any
 from pydantic import ValidationError
 
 from iif_core.errors import InputError
+from workflow import plugins
 from workflow.settings import batch_table, relight_plans, study_files
 from workflow.settings.explain import explain
 from workflow.settings.names import (
     DEFAULT,
     QUALITIES,
+    REPOSITORY,
     RESERVED,
     SCENE_NAME,
     configuration,
@@ -23,8 +25,7 @@ from workflow.settings.names import (
     scene_names,
     scene_path,
 )
-from workflow.settings.scene import SceneSettings
-from workflow.settings.source import Capture
+from workflow.settings.scene import Capture, SceneSettings
 from workflow.settings.yaml_file import read_yaml
 
 
@@ -168,6 +169,9 @@ def _quality(quality: str, root: Path) -> dict[str, Any]:
         hint = did_you_mean(quality, names)
         raise InputError(f"--config quality={quality}: unknown quality.{hint} Allowed: {', '.join(names)}")
     settings = read_yaml(configuration(f"quality/{quality}.yaml", root))
+    added = (REPOSITORY / folder / f"{quality}.yaml" for folder in plugins.quality_folders())
+    for path in (path for path in added if path.is_file()):
+        settings = merge(read_yaml(path), settings)
     if "quality" not in settings:
         return settings
     other, own = settings["quality"], {key: value for key, value in settings.items() if key != "quality"}

@@ -14,10 +14,6 @@ class Render(Section):
 
     samples: int = Field(16, ge=1)
     """Paths per pixel."""
-    max_bounces: int = Field(16, ge=1, le=64)
-    """Longest path, in bounces."""
-    denoise: bool = True
-    """Denoise the re-renderings. They are looked at and compared; nothing is fitted to them."""
 
 
 class Metrics(Section):
@@ -61,12 +57,6 @@ class Room(Section):
     its square."""
     samples: int = Field(64, ge=1)
     """Paths for each texel of the light maps, for all lamps together."""
-    max_bounces: int = Field(16, ge=1, le=64)
-    """Longest path, in bounces."""
-    denoise: bool = True
-    """Denoise the light map of each lamp by itself, and keep the mean light on every part."""
-    texture_size: int = Field(2048, ge=64, le=8192)
-    """Largest side of the textures in the page, in texels."""
     max_mb: float = Field(25.0, ge=2)
     """Largest size of `room.html` in MB: light maps take at most half of it, and photographs become smaller, or are left out,
     until it fits."""

@@ -17,8 +17,6 @@ class PriorBase(Section):
     `--set-scatter prior=8` pays."""
     samples: int = Field(8, ge=1, le=256)
     """Predictions per photograph, K."""
-    seed: int | None = Field(None, ge=0, lt=2**31)
-    """Seed of the predictions alone; by default the seed of the scene. Without effect on `kind: files`."""
 
 
 class FilesPrior(PriorBase):
@@ -39,8 +37,6 @@ class RetinexPrior(PriorBase):
 
     BY_VIEW: ClassVar[bool] = False  # the light is estimated from all photographs
     kind: Literal["retinex"]
-    mean_albedo: float = Field(0.4, gt=0, lt=1)
-    """Mean albedo to which each prediction is scaled."""
 
 
 class LearnedPrior(PriorBase):
@@ -58,14 +54,10 @@ class LearnedPrior(PriorBase):
 class DiffusionPrior(PriorBase):
     accept_license: bool = False
     """Set to `true` if you have read the licence of the weights and may use them for this."""
-    tile: int = Field(1024, ge=64, le=4096, multiple_of=64)
-    """Edge in pixels of the tiles in which larger pictures are sampled; they overlap by a quarter."""
     batch: int | None = Field(None, ge=1)
     """Samples computed together; by default 4 on a GPU, and one per thread on a CPU."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """`auto`: the GPU if torch finds one."""
-    precision: Literal["auto", "float32", "float16", "bfloat16"] = "auto"
-    """Precision of the U-Net; `auto`: float16 on a GPU, float32 on a CPU. The rest of the model is float32."""
 
 
 class RgbxPrior(DiffusionPrior):
@@ -79,8 +71,6 @@ class RgbxPrior(DiffusionPrior):
     """Expected commit of the checkpoint, or its first digits; not compared with a folder that does not state its commit."""
     steps: int = Field(50, ge=1, le=1000)
     """Denoising steps."""
-    longest_side: int = Field(1024, ge=64, le=8192)
-    """Longest side in pixels to which photographs are scaled for the model; the maps are scaled back."""
 
 
 class MarigoldPrior(DiffusionPrior):
@@ -94,8 +84,6 @@ class MarigoldPrior(DiffusionPrior):
     """Expected commit of the checkpoint, or its first digits; not compared with a folder that does not state its commit."""
     steps: int | None = Field(None, ge=1, le=1000)
     """Denoising steps; by default as many as the checkpoint recommends (4)."""
-    longest_side: int | None = Field(None, ge=64, le=8192)
-    """Longest side in pixels to which photographs are scaled for the model; by default as the checkpoint recommends (768)."""
 
 
 Member = Annotated[
@@ -123,7 +111,7 @@ class PooledPrior(PriorBase):
         return {**value, "of": [{**common, **one} if isinstance(one, dict) else one for one in members]}
 
 
-Prior = Annotated[get_args(Member)[0] | PooledPrior, Field(discriminator="kind")]
+Prior = Annotated[get_args(Member)[0] | plugins.extended("prior.pooled", PooledPrior), Field(discriminator="kind")]
 
 
 def members(prior: dict[str, Any]) -> list[dict[str, Any]]:

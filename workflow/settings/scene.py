@@ -8,17 +8,18 @@ from typing import Any, Literal, get_args
 from pydantic import Field, field_validator, model_validator
 
 from workflow import plugins
-from workflow.settings import affines, base, light, outputs
+from workflow.settings import affines, base, light, outputs, source
 from workflow.settings.by_hand import ByObject, Components
 from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES
 from workflow.settings.limits import Limits
-from workflow.settings.prior import LearnedPrior, Member, Prior, predictions
+from workflow.settings.prior import LearnedPrior, Member, Prior
 from workflow.settings.relight import Relightings, lamp_bases, recombines
 from workflow.settings.section import Section
 from workflow.settings.segmentation import GeometrySegmentation, Segmentation
-from workflow.settings.source import Capture, Source
+from workflow.settings.source import Source
 
 _SECTIONS: dict[str, type[Section]] = {
+    "capture": source.Capture,
     "base": base.Base,
     "emission": light.Emission,
     "shading": light.Shading,
@@ -33,8 +34,8 @@ _SECTIONS: dict[str, type[Section]] = {
 """Sections to which plug-ins may add fields."""
 EXTENDED = {name: plugins.extended(name, own) for name, own in _SECTIONS.items()}
 """The same with those fields."""
-Base, Emission, Shading, SecondLook, Affines = (
-    EXTENDED[name] for name in ("base", "emission", "shading", "second_look", "affines")
+Capture, Base, Emission, Shading, SecondLook, Affines = (
+    EXTENDED[name] for name in ("capture", "base", "emission", "shading", "second_look", "affines")
 )
 Render, Metrics, Export, Report, Room = (EXTENDED[name] for name in ("render", "metrics", "export", "report", "room"))
 
@@ -47,9 +48,9 @@ class SceneSettings(Section):
     capture: Capture = Capture()
     limits: Limits = Limits()
     """What a quality may ask for at most."""
-    prior: Prior = LearnedPrior()
+    prior: Prior = plugins.extended("prior.learned", LearnedPrior)()
     """Where the K material predictions come from."""
-    segmentation: Segmentation = GeometrySegmentation()
+    segmentation: Segmentation = plugins.extended("segmentation.geometry", GeometrySegmentation)()
     """Which surface belongs to which object."""
     base: Base = Base()
     emission: Emission = Emission()
@@ -90,55 +91,28 @@ class SceneSettings(Section):
         return {"kind": "geometry", **value} if isinstance(value, dict) else value
 
     @model_validator(mode="after")
-    def _known_predictions(self) -> SceneSettings:
-        made, used = predictions(self.prior.model_dump()), self.base.predictions
-        if used is not None and used > made:
-            raise ValueError(
-                f"`base: predictions` is {used}, but `prior` makes {made} (`samples`); lower the one or raise the other"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _overridden(self) -> SceneSettings:
-        """Put components that are forced, and have a setting of their own, in the place of that setting."""
-        choice = self.components
-        forced = {name: value for name, value in choice.model_dump().items() if value != "auto"}
-        own = {
-            "environment": ("emission", "environment", {"on": "on", "off": "off"}),
-            "radiance_cache": ("shading", "indirect", {"on": "cache", "off": "path"}),
-            "denoiser": ("render", "denoise", {"on": True, "off": False}),
-        }
-        for component, (section, key, values) in own.items():
-            if component in forced:
-                part, value = getattr(self, section), values[forced[component]]
-                if key in part.model_fields_set and getattr(part, key) not in (value, "auto"):
-                    raise ValueError(
-                        f"`components: {component}: {forced[component]}` contradicts"
-                        f" `{section}: {key}: {getattr(part, key)}`; remove one of the two"
-                    )
-                object.__setattr__(self, section, part.model_copy(update={key: value}))
-        return self
-
-    @model_validator(mode="after")
-    def _automatic_shading(self) -> SceneSettings:
-        """Replace `shading: {pixels: auto}` by the number or `all`, and `noise: auto` by the number: what is traced follows from
-        what is read."""
-        cells = self.affines.of_cells(self.prior.kind)
-        every = bool(cells) or self.affines.pixels == "all"
-        asked, needed = self.shading.pixels, "all" if every else self.affines.pixels
-        if asked == "auto":
-            object.__setattr__(self, "shading", self.shading.model_copy(update={"pixels": needed}))
-        elif asked != "all" and (every or asked < self.affines.pixels):
-            why = (
-                f"{cells or '`affines: pixels: all`'} reads every pixel"
-                if every
-                else f"the fit reads {needed} (`affines: pixels`)"
-            )
-            raise ValueError(f"`shading: pixels` is {asked}, but {why}; write `auto`, or at least `{needed}`")
+    def _automatic_noise(self) -> SceneSettings:
+        """Replace `shading: {noise: auto}` by the number."""
         if self.shading.noise == "auto":
-            noise = NOISE_OF_TEXTURES if cells else NOISE_OF_OBJECTS
+            noise = NOISE_OF_TEXTURES if self.affines.of_cells(self.prior.kind) else NOISE_OF_OBJECTS
             object.__setattr__(self, "shading", self.shading.model_copy(update={"noise": noise}))
         return self
+
+    def implied(self) -> dict[str, dict[str, Any]]:
+        """Return what stages read and other settings decide: section -> key -> plain value."""
+        every = bool(self.affines.of_cells(self.prior.kind)) or self.affines.pixels == "all"
+        chosen = self.components
+        return {
+            "emission": {"environment": chosen.environment},
+            # What is traced follows from what is read.
+            "shading": {
+                "pixels": "all" if every else self.affines.pixels,
+                "indirect": {"auto": "auto", "on": "cache", "off": "path"}[chosen.radiance_cache],
+            },
+            "affines": {"textured": self.affines.textured(self.prior.kind)},
+            "render": {"denoise": chosen.denoiser != "off"},
+            "room": {"denoise": chosen.denoiser != "off"},
+        }
 
 
 SceneSettings = plugins.extended("scene", SceneSettings)
@@ -163,9 +137,11 @@ def section_in(annotation: Any) -> Any:
 
 
 def dump(settings: SceneSettings) -> dict[str, Any]:
-    """Return the settings as plain JSON values, and what stage `lamp_images` traces for the relightings among them, with the
-    names of those that are summed from it."""
+    """Return the settings as plain JSON values, with what they imply, and what stage `lamp_images` traces for the relightings
+    among them, with the names of those that are summed from it."""
     document = settings.model_dump(mode="json")
+    for section, values in settings.implied().items():
+        document[section] |= values
     summed = [entry["name"] for entry in document["relight"] if recombines(entry)]
     return {**document, "lamp_images": lamp_bases(document["relight"]), "recombined": summed}
 
@@ -182,11 +158,19 @@ def select(document: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
 
 
 @cache
-def _added(section: str) -> dict[str, Any]:
-    """Return the fields that plug-ins add to a section, with their defaults as they are dumped."""
-    own = _SECTIONS.get(section, Section).model_fields
-    dumped = EXTENDED[section]().model_dump(mode="json") if section in EXTENDED else {}
-    return {name: value for name, value in dumped.items() if name not in own}
+def _added(section: type[Section]) -> dict[str, Any]:
+    """Return the fields that plug-ins add to a section of the product, with their defaults."""
+    own = next(base for base in section.__mro__ if base.__module__.startswith("workflow."))
+    if "kind" in section.model_fields and "kind" not in own.model_fields:  # a kind of a plug-in
+        return {}
+    return {name: field.default for name, field in section.model_fields.items() if name not in own.model_fields}
+
+
+def _without_added(section: type[Section] | None, value: Any) -> Any:
+    """Return a dumped section, and the members that it pools, without the fields of plug-ins that are at their defaults."""
+    added = _added(section) if section else {}
+    out = {name: entry for name, entry in value.items() if name not in added or entry != added[name]}
+    return out | ({"of": [_without_added(POOLED[one["kind"]], one) for one in value["of"]]} if "of" in value else {})
 
 
 def recorded(document: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
@@ -194,10 +178,10 @@ def recorded(document: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
     do not depend on plug-ins that take no part."""
     out: dict[str, Any] = {}
     for key, value in select(document, keys).items():
-        section, _, field = key.partition(".")
-        added = _added(section)
-        if not field and added:
-            out[key] = {name: entry for name, entry in value.items() if name not in added or entry != added[name]}
-        elif field not in added or value != added[field]:
+        name, _, field = key.partition(".")
+        section = UNIONS[name][document[name]["kind"]] if name in UNIONS else EXTENDED.get(name)
+        if not field:
+            out[key] = _without_added(section, value) if isinstance(value, dict) else value
+        elif section is None or field not in _added(section) or value != _added(section)[field]:
             out[key] = value
     return out

@@ -15,8 +15,6 @@ class PhotographedSource(Section):
     alignment: Annotated[Literal["check", "warn", "off"], ON_OFF] = "check"
     """Compare the projected mesh with depth images, sparse points or image edges; `check` refuses a mismatch and reports the
     measured disagreement."""
-    alignment_tolerance: float = Field(0.05, gt=0)
-    """Largest accepted median relative difference of depth, where depth images or sparse points exist."""
     registration: Annotated[Literal["auto", "off"], ON_OFF] = "auto"
     """`auto`: correct poses, focal length and principal point by the mesh and the other photographs, if held-out surface confirms
     the correction, and leave out blurred and badly posed photographs. `off`: use them as given."""
@@ -101,12 +99,8 @@ class Capture(Section):
     """Image width in pixels; existing photographs are reduced to fit width x height, with their aspect ratio kept."""
     height: int = Field(160, ge=16, le=8192)
     """Image height in pixels."""
-    samples: int = Field(64, ge=1)
-    """Paths per pixel for rendered photographs."""
     exposure: Literal["given", "estimate"] = "given"
     """`estimate`: find the exposures of the photographs from surface that several of them show."""
-    denoise: bool = False
-    """Denoise rendered photographs: fewer samples suffice, at the price of a bias of a few per cent."""
     test_every: int = Field(0, ge=0)
     """Hold out every n-th view: no stage before `render` and `metrics` reads its photograph (0 = none)."""
 

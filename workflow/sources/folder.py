@@ -278,7 +278,7 @@ def _checked_alignment(task: _Task, taken: _Taken) -> list[str]:
     Raises:
         InputError: they do not, and `source.alignment` is `check`.
     """
-    mode, tolerance = task.source.alignment, task.source.alignment_tolerance
+    mode, tolerance = task.source.alignment, alignment.TOLERANCE
     if mode == "off":
         return ["alignment was not checked (`source.alignment: off`)"]
     out, path = taken.aligned.notes(tolerance), task.inputs.transforms.path
@@ -316,7 +316,7 @@ def _better_depth(task: _Task, seen: list[tuple[Frame, View]]) -> str:
     pairs = [(f, pinhole(v)) for f, v in seen if f.depth is not None or (f.seen is not None and len(f.seen))]
     if not pairs:
         return ""
-    listed, tolerance = task.inputs.transforms, task.source.alignment_tolerance
+    listed, tolerance = task.inputs.transforms, alignment.TOLERANCE
     return alignment.explain(pairs, task.room.depth_along, task.conventions, listed.known, listed.depth_unit, tolerance)
 
 

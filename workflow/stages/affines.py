@@ -30,6 +30,7 @@ from workflow.scene.decoded import DecodedViews
 from workflow.scene.named import object_names
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import write_response
+from workflow.settings.options import options_of
 
 Solver = Callable[[FitProblem, Response], FitResult]
 """From the problem and the response of stage emission to the fit, in the gauge of the given light."""
@@ -86,11 +87,9 @@ def fit(
 
 
 def _direct(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Solver:
-    settings = job.settings.affines
-    options = FitOptions(
-        iterations=settings.iterations,
-        population=settings.population,
-        robust_width=settings.robust_width,
+    options = options_of(
+        FitOptions,
+        job.settings.affines,
         response_prior=prior,
         # This prior read the brightness of objects from the same photographs.
         base_tells_levels=job.settings.prior.kind != "retinex",
@@ -151,7 +150,7 @@ def _problem(
                 layer.add(balanced(part[half].mean(0), balance))
         job.progress(done + 1, len(views), "views read")
     joined = {name: np.concatenate(rows.pop(name)) for name in list(rows)}
-    value, saturated = sensor_bounds(np.asarray(joined["value"], np.float32), capture.is_hdr, job.settings.emission.saturation)
+    value, saturated = sensor_bounds(np.asarray(joined["value"], np.float32), capture.is_hdr)
     d, s0, s1 = (tuple(layer.array() for layer in layers) for layers in zip(*cached, strict=True))
     object_id = joined["object"].astype(np.int32)
     problem = FitProblem(

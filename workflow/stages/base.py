@@ -11,7 +11,7 @@ import numpy as np
 
 from iif_core.fusion.direct import solve_direct
 from iif_core.fusion.gauge import parts_per_object
-from iif_core.fusion.options import FusionOptions
+from iif_core.fusion.options import CellOptions, FusionOptions
 from iif_core.fusion.problem import FusionProblem, FusionResult, with_every_object
 from iif_core.surface.cell_grid import CellGrid, CellValues
 from iif_core.surface.cells import neighbour_pairs
@@ -24,6 +24,7 @@ from workflow.scene.decoded import DecodedViews
 from workflow.scene.fusion_input import cells_of_views, points_of_views, tangents_of_views, weights_and_segments
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.predictions import Predictions, StoredPredictions
+from workflow.settings.options import options_of
 
 MEMORY_BYTES = 1 << 30
 """Predictions that stay in memory between sweeps; those of further views are mapped from a file without a name."""
@@ -37,14 +38,8 @@ def run(job: Job) -> None:
 def fuse(job: Job, prior: Predictions) -> None:
     """Fuse predictions, and write what stage base writes; the job has the settings `base` and `seed`, and capture and
     segmentation upstream."""
-    settings = job.settings.base
     found = read_inputs(job, prior)
-    options = FusionOptions(
-        temperature=max(settings.temperature, settings.final_temperature),
-        memory=MEMORY_BYTES,
-        spill=Scratch(job.writer.directory),
-        **{name: getattr(settings, name) for name in ("sweeps", "anneal", "ridge", "final_temperature", "robust", "seams")},
-    )
+    options = options_of(FusionOptions, job.settings.base, memory=MEMORY_BYTES, spill=Scratch(job.writer.directory))
     with job.timed("solve"):
         result = solve_direct(found.problem, options, partial(job.progress, what="passes over the views"), job.threads)
     write(job, found, result)
@@ -72,14 +67,14 @@ class Inputs:
 def read_inputs(job: Job, prior: Predictions, most: int | None = None) -> Inputs:
     """Put predictions on cells; at most the first `most` of each view, None = as many as the settings say."""
     capture = CaptureReader(job.read("capture"))
-    segmentation, settings = job.read("segmentation"), job.settings.base
+    segmentation, options = job.read("segmentation"), options_of(CellOptions, job.settings.base)
     views = [view for view in capture.used if prior.has(view)]
     decoded = DecodedViews(capture, segmentation)
-    grid, cell_maps = cells_of_views(job, decoded, views)
-    weights, segment_maps = weights_and_segments(job, decoded, views)
+    grid, cell_maps = cells_of_views(job, options, decoded, views)
+    weights, segment_maps = weights_and_segments(options, decoded, views)
     segments = segmentation.table("segments.parquet")
     n_objects = int(segmentation.table("objects.parquet")["object_id"].max(initial=-1)) + 1
-    used = min(prior.samples, most or settings.predictions or prior.samples)
+    used = min(prior.samples, most or options.predictions or prior.samples)
     problem = FusionProblem(
         lambda position: prior.maps(views[position], used),
         cell_maps,
@@ -90,7 +85,7 @@ def read_inputs(job: Job, prior: Predictions, most: int | None = None) -> Inputs
         weights,
         point=points_of_views(decoded, views),
         tangent=tangents_of_views(decoded, views),
-        neighbours=neighbour_pairs(grid.keys) if settings.seams else None,
+        neighbours=neighbour_pairs(grid.keys) if options_of(FusionOptions, job.settings.base).seams else None,
         scale=lambda position: prior.scale(views[position]),
     )
     return Inputs(problem, used, decoded, views, grid, segments["segment_id"], n_objects)

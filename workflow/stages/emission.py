@@ -28,6 +28,7 @@ from workflow.scene.light_files import write_found_light
 from workflow.scene.named import object_names
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.response_file import read_response_file
+from workflow.settings.options import options_of
 
 
 def run(job: Job) -> None:
@@ -54,25 +55,17 @@ def run(job: Job) -> None:
 
 def _photographs(job: Job, capture: CaptureReader, notes: list[str]) -> tuple[Photographs, CalibratedResponse]:
     """Return the photographs with response and gains, and how these were found."""
-    scene, setting, own = read_base_scene(job), job.settings.affines.response, job.settings.emission
-    options = EmissionOptions(
-        seed=job.seed,
-        min_observations=own.min_observations,
-        cache_edge=own.cache_edge,
-        rows=own.rows,
-        samples=own.samples,
-        max_bounces=own.max_bounces,
-        prune=own.prune,
-    )
+    scene, setting = read_base_scene(job), job.settings.affines.response
+    options = options_of(EmissionOptions, job.settings.emission, seed=job.seed)
     photos = Photographs(
         views=capture.used,
         every=capture.views,
         scene=scene,
         names=object_names(job.read("segmentation"), scene.n_objects),
         tracer=Tracer(scene),
-        sensor=Sensor(response("identity"), capture.is_hdr, own.saturation),
+        sensor=Sensor(response("identity"), capture.is_hdr),
         gains=view_exposures(capture, notes),
-        records=ViewRecords(job, capture, scene),
+        records=ViewRecords(job, capture, scene, options.pixels),
         options=options,
         log=Log(job.log.info, job.progress),
     )

@@ -42,7 +42,7 @@ def _probed(job: Job, capture: CaptureReader) -> tuple[list[Decision], dict[str,
     vertices, faces = capture.mesh()
     with job.timed("probes"):
         geometry = build_geometry(vertices, faces, np.zeros(len(faces), np.int32))
-        rows = probe_rows(job, capture, geometry, settings.emission.saturation)
+        rows = probe_rows(job, capture, geometry)
         light, gloss = light_evidence(rows.light, job.seed), gloss_evidence(rows.gloss, job.seed)
     escape = rows.escape_primary, rows.escape_secondary
     plan = [

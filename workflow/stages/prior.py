@@ -15,7 +15,7 @@ from iif_core.reflectance.material import PROPERTIES
 from workflow import plugins
 from workflow.artifacts.scratch import Scratch
 from workflow.artifacts.store import StageWriter, rgb, split_rgb
-from workflow.priors import Predicted, members, predictor
+from workflow.priors import Predicted, members, predictor, seed_of
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.segmentations.surface import FOLDS
@@ -49,7 +49,7 @@ def predicted(job: Job, capture: CaptureReader, views: list[View]) -> list[Row]:
     left = [view for view, own in zip(views, kept, strict=True) if own is None]
     found: Iterator[Predicted] = iter(())
     if left:
-        seed = job.seed if job.settings.prior.seed is None else job.settings.prior.seed
+        seed = seed_of(job.settings.prior, job.seed)
         predict = predictor(job.settings, capture, seed, Scratch(job.writer.directory), job.threads)
         threads = job.threads if getattr(predict, "concurrent", False) else 1
         found = map_in_order(lambda i: predict(left[i]), len(left), threads)

@@ -22,6 +22,7 @@ from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.picture_facts import view_attributes
 from workflow.scene.recovered import Recovered, read_recovered, read_response
 
+MAX_BOUNCES = 16  # of a path
 _SEEDS = 0x72656E  # keeps the random streams of this stage apart from those of others
 
 
@@ -59,7 +60,7 @@ def run(job: Job) -> None:
         _, face_id = capture.gbuffer(view)
         seed = ((job.seed << 32) | _SEEDS) << 32 | view.view_id
         fitted = _fitted(job, view)
-        paths = PathOptions(job.settings.render.samples, job.settings.render.max_bounces, seed)
+        paths = PathOptions(job.settings.render.samples, MAX_BOUNCES, seed)
         jitter = _pixel_steps(view, face_id, through_holes)
         radiance = render(world, eye, _directions(view).reshape(-1, 3), paths, jitter).reshape(view.height, view.width, 3)
         if not np.isfinite(radiance).all():

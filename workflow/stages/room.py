@@ -21,6 +21,8 @@ from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import read_recovered
 
+MAX_BOUNCES = 16  # of a path
+TEXTURE_SIZE = 2048  # largest side of the textures in the page, in texels
 _SEEDS = 0x726F6F6D  # keeps the random streams of this stage apart from those of others
 FILL = 0.6
 """Share of the texels of an atlas that have surface, about."""
@@ -42,7 +44,7 @@ def run(job: Job) -> None:
     job.log.info("%d lamps, light maps of %d x %d, %d texels with surface", len(lamps.lamps), size, size, len(texels.index))
     with job.timed("light"):
         seed = (job.seed << 32) | _SEEDS
-        paths = (wanted.samples, wanted.max_bounces, seed, wanted.denoise)
+        paths = (wanted.samples, MAX_BOUNCES, seed, wanted.denoise)
         light = trace_lamps(
             parts, texels, recovered.surface, lamps, *paths, lambda done, total: job.progress(done, total, "points lit")
         )
@@ -52,7 +54,7 @@ def run(job: Job) -> None:
     frame = build.frame_of(parts, texels, up, poses[:, :3, 3])
     geometry, places, bounds = build.geometry_blobs(parts, frame)
     blobs = geometry | build.light_blobs(halves, texels) | {"lobes": build.lobe_blob(), "colours": build.colour_blob()}
-    blobs |= build.picture_blobs(atlas, wanted.texture_size)
+    blobs |= build.picture_blobs(atlas, TEXTURE_SIZE)
     exposure = build.base_exposure(atlas, texels, light, lamps)
     emission = radiance_of_emitters(job, recovered)
     document: dict[str, Any] = {
@@ -99,7 +101,7 @@ def run(job: Job) -> None:
         "lamps": [lamp.name for lamp in lamps.lamps],
         "lightmap_size": size,
         "texels": len(texels.index),
-        "texture_size": min(atlas.size, wanted.texture_size),
+        "texture_size": min(atlas.size, TEXTURE_SIZE),
         "photograph_width": width,
         "exposure": exposure,
         "mean_light": light.mean((0, 2)).tolist() if len(light) else [],

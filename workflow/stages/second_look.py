@@ -9,7 +9,7 @@ import numpy as np
 
 from iif_core.numerics.parallel import map_in_order
 from workflow.artifacts.scratch import Scratch
-from workflow.priors import learned, members
+from workflow.priors import learned, members, seed_of
 from workflow.priors.pooled import member_settings
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import SECOND_LOOK
@@ -49,7 +49,7 @@ class _Predictions:
         first = sum(one.samples for one in pool[:place])
         self._new = slice(first, first + own.samples)
         self._first = StoredPredictions(job.read("prior")) if len(pool) > 1 else None
-        seed = job.seed if own.seed is None else own.seed
+        seed = seed_of(own, job.seed)
         views = capture.used
         # A scratch file holds what the network needs of the views; it is deleted when the network ends.
         gathered = Scratch(job.writer.directory)

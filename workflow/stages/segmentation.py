@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
+from iif_core.objects.options import BorderOptions
 from iif_core.surface.segments import interior, partition_agreement, segment_table
 from iif_core.surface.triangles import face_geometry
 from workflow import plugins
@@ -18,6 +19,7 @@ from workflow.decisions import objects as decisions
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader
 from workflow.segmentations.surface import FOLDS, Objects, Stability, Surface
+from workflow.settings.options import options_of
 
 
 def run(job: Job) -> None:
@@ -41,7 +43,7 @@ def run(job: Job) -> None:
     maps = [_object_map(capture.gbuffer(view)[1], objects.object_of_face) for view in capture]
     segment_maps, table = segment_table(maps)
     view_ids = np.array([view.view_id for view in capture], np.int32)
-    border = job.settings.segmentation.border_erosion
+    border = options_of(BorderOptions, job.settings.segmentation).border_erosion
     for i, view in enumerate(capture):
         job.writer.exr(
             f"maps/{view.name}.exr",

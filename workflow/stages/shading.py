@@ -9,8 +9,8 @@ import numpy as np
 
 from iif_core.camera.pixels import ViewPixels
 from iif_core.light.base_scene import BaseScene, cache_origin
+from iif_core.light.options import ShadingOptions
 from iif_core.light.shading import (
-    ShadingOptions,
     cells_of_views,
     diffuse_light,
     glossiest,
@@ -31,6 +31,7 @@ from workflow.scene.base_scene import read_lit_scene, read_object_gains, read_ra
 from workflow.scene.cached_light import facts_of_diffuse, words_of_diffuse, write_light_of_view
 from workflow.scene.decoded import DecodedViews
 from workflow.scene.normal_form import CaptureReader
+from workflow.settings.options import options_of
 
 
 def run(job: Job) -> None:
@@ -41,7 +42,7 @@ def run(job: Job) -> None:
     from iif_core.light.transport.scene import Scene
 
     (scene, light), own = read_lit_scene(job), job.settings.shading
-    options = ShadingOptions(job.seed, own.samples, own.noise, own.max_samples, own.max_bounces)
+    options = options_of(ShadingOptions, own, seed=job.seed)
     levels, mixed = roughness_levels(own.levels), light.emits | scene.is_sheer
     decoded = DecodedViews(CaptureReader(job.read("capture")), job.read("segmentation"))
     counts = np.zeros(max(scene.n_objects, 1), np.int64)  # of the pixels of each object that may enter the fit
@@ -53,7 +54,7 @@ def run(job: Job) -> None:
             if view.split != "test":
                 counts[:] += count_eligible(pixels, mixed, scene.n_objects)
 
-    cells = cells_of_views(seen(), own.cell_edge, cache_origin(scene, own.cell_edge), options)
+    cells = cells_of_views(seen(), options.cell_edge, cache_origin(scene, options.cell_edge), options)
     drawn = None if own.pixels == "all" else FitPixels.evenly(counts, int(own.pixels), mixed, job.seed)
     device.mitsuba()
     # Surface outside all photographs is given the object gains that stage emission found.

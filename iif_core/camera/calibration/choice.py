@@ -19,7 +19,7 @@ from iif_core.camera.calibration.rows import (
 )
 from iif_core.camera.gains import CameraGains, GainRows, choose_gains, estimate
 from iif_core.camera.overlap import PatchRows
-from iif_core.camera.response import START, Response, response
+from iif_core.camera.response import SATURATION, START, Response, response
 
 CANDIDATES = ("srgb", "gamma", "ggcm", "spline")
 """Families that `auto` compares, smallest first."""
@@ -86,7 +86,7 @@ def calibrate_response(
     rows: PatchRows,
     exposure: np.ndarray,
     families: Sequence[str] = CANDIDATES,
-    saturation: float = 0.99,
+    saturation: float = SATURATION,
     given: bool = True,
 ) -> CalibratedResponse:
     """Fit all families and choose the smallest one that no other beats significantly (Eq. C.24).

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.camera.response import Response
+from iif_core.camera.response import SATURATION, Response
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Sensor:
 
     curve: Response
     is_hdr: bool
-    saturation: float
+    saturation: float = SATURATION
 
     def radiance(self, value: np.ndarray, exposure: float) -> tuple[np.ndarray, np.ndarray]:
         """Return (n, 3) linear radiance f^-1(I) / exposure, and (n, 3) bool where it is only a lower bound (Eq. L.1)."""

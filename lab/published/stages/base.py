@@ -26,6 +26,7 @@ from workflow.artifacts.store import split_rgb
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import View
 from workflow.scene.predictions import Predictions, StoredPredictions
+from workflow.settings.options import options_of
 from workflow.stages.base import MEMORY_BYTES, read_inputs, write
 
 KEPT_EVERY = 30.0
@@ -76,12 +77,12 @@ def _solve(job: Job, problem: FusionProblem) -> tuple[FusionResult, SgdFit | Non
         texture = fit.value, fit.scale, fit.corrections, fit.alpha
         return describe_fit(problem, *texture, fit.history, job.threads, MEMORY_BYTES), fit
     progress = partial(job.progress, what="passes over the views")
-    options = FusionOptions(
-        {"raw": "texel_mean", "image_affine": "full"}.get(settings.variant, settings.variant),
-        temperature=max(settings.temperature, settings.final_temperature),
+    options = options_of(
+        FusionOptions,
+        settings,
+        variant={"raw": "texel_mean", "image_affine": "full"}.get(settings.variant, settings.variant),
         memory=MEMORY_BYTES,
         spill=Scratch(job.writer.directory),
-        **{name: getattr(settings, name) for name in ("sweeps", "anneal", "ridge", "final_temperature", "robust", "seams")},
     )
     if settings.objective == "distribution":
         return solve_distribution(problem, options, progress, job.threads, settings.polish), None

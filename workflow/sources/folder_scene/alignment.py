@@ -17,6 +17,7 @@ from workflow.sources.folder_scene import images
 from workflow.sources.folder_scene.mesh import TURNS
 from workflow.sources.folder_scene.transforms import METRES, Frame, opencv_pose
 
+TOLERANCE = 0.05  # largest accepted median relative difference of depth, where depth images or sparse points exist
 DEPTH_SAMPLES = 20_000  # depth pixels compared per view
 MIN_COMPARED = 0.2  # share of the measured depths that must meet the mesh
 MIN_POINTS = 20  # sparse points that a photograph must see to be compared by them
