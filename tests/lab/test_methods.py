@@ -44,8 +44,8 @@ def test_defaults_are_ours_and_those_of_the_solvers():
     ],
 )
 def test_free_cells_read_every_pixel(sections, pixels, noise):
-    shading = of(**sections).shading
-    assert (shading.pixels, shading.noise) == (pixels, noise)
+    shading = settings.dump(of(**sections))["shading"]
+    assert (shading["pixels"], shading["noise"]) == (pixels, noise)
 
 
 @pytest.mark.parametrize(

@@ -40,8 +40,8 @@ def scene(tmp_path):
     ],
 )
 def test_what_is_read_decides_where_specular_light_is_traced_and_how_noisy_diffuse_light_may_be(scene, text, pixels, noise):
-    shading = settings.load("x", "draft", scene(f"{GOOD}{text}\n")).shading
-    assert (shading.pixels, shading.noise) == (pixels, noise)
+    shading = settings.dump(settings.load("x", "draft", scene(f"{GOOD}{text}\n")))["shading"]
+    assert (shading["pixels"], shading["noise"]) == (pixels, noise)
 
 
 def test_noise_of_the_light_can_be_set(scene):
@@ -72,7 +72,7 @@ def test_pixels_of_specular_light_that_cannot_be(scene, text, names):
 def test_scene_over_preset_over_default(scene):
     root = scene(GOOD + "shading: {samples: 7}\n", "shading: {samples: 5, levels: 4}\n")
     got = settings.load("x", "draft", root)
-    assert (got.shading.samples, got.shading.levels, got.shading.max_bounces) == (7, 4, 6)
+    assert (got.shading.samples, got.shading.levels, got.render.samples) == (7, 4, 16)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def test_a_folder_with_scenes_of_its_own_uses_these_alone_with_the_presets_of_th
     root = scene(GOOD)
     (root / "config/quality/draft.yaml").unlink()
     paper = settings.read_yaml(repository / "config/quality/paper.yaml")
-    assert settings.load("x", "paper", root).capture.samples == paper["capture"]["samples"] != 64
+    assert settings.load("x", "paper", root).capture.views == paper["capture"]["views"] != 16
     assert [line.name for line in batch_table.read_table(root)] == ["x"]
     with refused("config/scenes/kitchen.yaml", "x"):
         settings.load("kitchen", "draft", root)
@@ -237,19 +237,22 @@ def test_yaml_is_read_alike_with_and_without_libyaml(tmp_path, monkeypatch):
         ("radiance_cache: off", "shading", "indirect", "path"),
         ("radiance_cache: on", "shading", "indirect", "cache"),
         ("denoiser: off", "render", "denoise", False),
+        ("denoiser: off", "room", "denoise", False),
+        ("environment: on", "render", "denoise", True),
         ("specular: off", "emission", "environment", "auto"),
     ],
 )
-def test_a_forced_component_is_the_setting_of_its_own(scene, words, section, key, value):
-    found = settings.load("x", "draft", scene(f"{GOOD}components: {{{words}}}\n"))
-    assert getattr(getattr(found, section), key) == value
+def test_stages_read_a_forced_component(scene, words, section, key, value):
+    found = settings.dump(settings.load("x", "draft", scene(f"{GOOD}components: {{{words}}}\n")))
+    assert found[section][key] == value
 
 
 @pytest.mark.parametrize(
     ("text", "names"),
     [
-        ("components: {environment: off}\nemission: {environment: on}", ["components", "emission: environment: on"]),
-        ("components: {denoiser: on}\nrender: {denoise: false}", ["components", "render: denoise: False"]),
+        ("emission: {environment: on}", ["emission.environment", "`components.environment`"]),
+        ("render: {denoise: false}", ["render.denoise", "`components.denoiser`"]),
+        ("shading: {indirect: path}", ["shading.indirect", "`components.radiance_cache`"]),
         ("components: {metallic: on}", ["components.metallic", "'on'", "'auto' or 'off'"]),
         ("components: {gloss: off}", ["components.gloss", "specular"]),
         ("components: {specular: maybe}", ["components.specular", "'maybe'", "'auto', 'on' or 'off'"]),

@@ -36,6 +36,10 @@ RENAMED = {
     "point": "quality",
     "override": "components",
     "overrides": "materials",
+    "emission.environment": "components.environment",
+    "shading.indirect": "components.radiance_cache",
+    "render.denoise": "components.denoiser",
+    "room.denoise": "components.denoiser",
 }
 """Keys of earlier versions -> their names now."""
 
