@@ -46,6 +46,7 @@ SECTIONS = {
     "prior.marigold": "lab.settings.prior:MarigoldPrior",
     "prior.pooled": "lab.settings.pooled:PooledPrior",
     "segmentation.given": "lab.settings.segmentation:GivenSegmentation",
+    "segmentation.masks": "lab.settings.segmentation:MaskSegmentation",
     "segmentation.geometry": "lab.settings.segmentation:GeometrySegmentation",
     "base": "lab.settings.methods:Base",
     "emission": "lab.settings.methods:Emission",

@@ -33,10 +33,19 @@ class Relit(Section):
     """Denoise the pictures of both."""
 
 
+class SecondLook(Section):
+    """Predicting and fusing once more, under the light that was found (prior `learned` alone)."""
+
+    enabled: bool = True
+    """`false`: the fit starts from the first base texture, which saves a sixth of the CPU time from `prior` to `affines`
+    (docs/method/priors.md#a-second-look)."""
+
+
 class LabScene(SceneSettings):
     """The settings of the product, those of scored relighting, and what must hold where another method than ours is chosen."""
 
     relit: Relit = Relit()
+    second_look: SecondLook = SecondLook()
 
     @model_validator(mode="after")
     def _known_predictions(self) -> LabScene:
@@ -63,6 +72,7 @@ class LabScene(SceneSettings):
     def implied(self) -> dict[str, dict[str, Any]]:
         """Return what other settings decide, where no setting of the laboratory does."""
         found = super().implied()
+        found["second_look"] = self.second_look.model_dump()
         if self.shading.pixels != "auto":
             found["shading"]["pixels"] = self.shading.pixels
         return found

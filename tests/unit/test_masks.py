@@ -541,7 +541,7 @@ def test_masks_without_a_single_mask_are_refused(photographed, tmp_path):
     shutil.copytree(root, tmp_path / "copy")
     for file in (tmp_path / "copy/data/own/masks").iterdir():
         Image.new("I;16", (64, 48)).save(file)
-    with refused("segmentation: {kind: masks}", "segmentation.min_points", 4):
+    with refused("segmentation: {kind: masks}", 4):
         own.run(tmp_path / "copy", "capture", "segmentation")
 
 

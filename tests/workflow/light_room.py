@@ -339,28 +339,6 @@ def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
     second_look.finish()
 
 
-EMISSION = {
-    "saturation": 0.99,
-    "min_observations": 8,
-    "cache_edge": 0.06,
-    "max_bounces": 6,
-    "pixels": 4_000_000,
-    "rows": 12000,
-    "samples": 16,
-    "prune": 0.01,
-    "environment": "auto",
-}
-SHADING = {
-    "pixels": "all",
-    "samples": 32,
-    "levels": 10,
-    "cell_edge": 0.05,
-    "noise": 0.15,
-    "max_samples": 512,
-    "max_bounces": 6,
-    "indirect": "auto",
-}
-AFFINES = {
-    **{"response": "auto", "iterations": 60, "pixels": 200000, "population": True},
-    **{"ridge": 2e-3, "robust_width": 0.1, "scale": "found", "texture": "base"},
-}
+EMISSION = {"rows": 12000, "samples": 16, "environment": "auto"}
+SHADING = {"pixels": "all", "samples": 32, "levels": 10, "cell_edge": 0.05, "noise": 0.15, "indirect": "auto"}
+AFFINES = {"response": "auto", "pixels": 200000, "scale": "found", "textured": False}

@@ -27,7 +27,7 @@ def _run(folder, dynamic_range, upto="metrics", pixels="all", **emission_setting
         "emission": {**EMISSION, "rows": 2000, "samples": 4, **emission_settings},
         "shading": {**SHADING, "pixels": pixels, "samples": 4, "levels": 5, "max_samples": 32},
         "affines": {**AFFINES, "iterations": 20, **({} if pixels == "all" else {"pixels": pixels})},
-        "render": {"samples": 8, "max_bounces": 8, "denoise": False},
+        "render": {"samples": 8, "denoise": False},
         "metrics": {"views": "all", "lpips_vgg": False},
         "export": {"max_faces_glb": 100_000, "texture_size": 256, "max_mb": 40.0, "normal_map": False},
         "report": {"views": 2, "credit": ""},

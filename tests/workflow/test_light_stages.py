@@ -95,10 +95,10 @@ def test_a_third_of_the_pixels_finds_the_same_light(hdr, tmp_path):
 def test_faces_between_the_chosen_pixels_are_seen(hdr):
     """No lamp may hide in a face that a photograph shows, though none of the pixels that are looked at lies on it."""
     folder, _ = hdr
-    job = StubJob("reader", folder, {"emission": {**EMISSION, "pixels": 1000}, "capture": {}, "affines": AFFINES})
+    job = StubJob("reader", folder, {"emission": EMISSION, "capture": {}, "affines": AFFINES})
     job.stage = STAGES["emission"]
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
-    records = emission_views.ViewRecords(job, capture, scene)
+    records = emission_views.ViewRecords(job, capture, scene, 1000)
     of_pixels, seen = set(), set()
     for view in capture.views:
         record = records[view]
@@ -320,7 +320,7 @@ def test_known_scale_of_a_lamp_and_of_a_patch(hdr):
 
 PLANNED = {
     "components": {"specular": "auto", "metallic": "auto"},
-    "emission": {**EMISSION, "environment": "auto", "saturation": 0.99},
+    "emission": EMISSION,
     "shading": SHADING,
 }
 

@@ -14,7 +14,7 @@ from workflow.scene.normal_form import CaptureReader
 from workflow.settings.base import Base
 from workflow.stages import base, second_look
 
-LEARNED = {"kind": "learned", "samples": 2, "seed": None, "device": "cpu"}
+LEARNED = {"kind": "learned", "samples": 2, "device": "cpu"}
 MADE = {"base.json", "cells.parquet", "objects.parquet", "segments.parquet", "selection.parquet"}
 
 
@@ -123,8 +123,8 @@ def test_predictions_that_are_pooled_with_the_learned_ones_stay(lit, tmp_path):
         {"view_id": np.repeat(ids, 3).astype(np.int32), "k": np.tile(np.arange(3, dtype=np.int32), len(ids))},
     )
     writer.finish()
-    other = {"kind": "files", "samples": 1, "seed": None}
-    job = StubJob("second_look", folder, {"prior": {"kind": "pooled", "samples": 8, "seed": None, "of": [other, LEARNED]}})
+    other = {"kind": "files", "samples": 1}
+    job = StubJob("second_look", folder, {"prior": {"kind": "pooled", "samples": 8, "of": [other, LEARNED]}})
     found = second_look._Predictions(job, CaptureReader(job.read("capture")))
     made = found.maps(views[0], 3)
     assert found.samples == 3 and np.allclose(made[0], 0.25)

@@ -63,9 +63,9 @@ def of_shading(found: DiffuseShading, asked: float) -> list[Figure]:
     flies = (np.abs(first - second) > APART * total) & (first + second > 0)
     return [
         figure("fireflies / share of the cells", float(flies.mean()) if len(flies) else 0.0, FIREFLIES,
-               "small bright lamps are met by chance; raise shading.max_samples"),
+               "small bright lamps are met by chance; raise shading.samples"),
         figure("noise of the light", found.noise_last, max(2 * asked, asked + 0.1),
-               "the light stayed noisier than asked (shading.noise); raise shading.max_samples"),
+               "the light stayed noisier than asked (shading.noise); raise shading.samples"),
     ]  # fmt: skip
 
 
@@ -76,7 +76,7 @@ def of_affines(facts: Mapping[str, float], converged: bool) -> list[Figure]:
                "photographs do not tell all numbers of some objects apart; what is assumed beforehand decides"),
         figure("pixels with little weight / share", facts.get("downweighted", 0.0), DOWNWEIGHTED,
                "the cached light of these pixels is too noisy; lower shading.noise"),
-        figure("fit not at rest / 1 = yes", float(not converged), 0.0, "raise affines.iterations"),
+        figure("fit not at rest / 1 = yes", float(not converged), 0.0, "the materials may change in further steps"),
     ]  # fmt: skip
 
 

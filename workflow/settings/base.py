@@ -1,4 +1,4 @@
-"""Settings of stage `base`, and of the second look that repeats it."""
+"""Settings of stage `base`."""
 
 from __future__ import annotations
 
@@ -13,11 +13,3 @@ class Base(Section):
 
     cell_footprints: float = Field(CellOptions.cell_footprints, gt=0)
     """Edge of a surface cell in median pixel footprints."""
-
-
-class SecondLook(Section):
-    """Predicting and fusing once more, under the light that was found (prior `learned` alone)."""
-
-    enabled: bool = True
-    """`false`: the fit starts from the first base texture, which saves a sixth of the CPU time from `prior` to `affines`
-    (docs/method/priors.md#a-second-look)."""

@@ -53,6 +53,20 @@ def _of_many(annotation: Any) -> str:
     return {list: "[]", dict: ".<name>"}.get(get_origin(annotation), "")
 
 
+FIRST = "What you set"
+PARTS = {
+    "Relighting": (
+        "Other light, edits and cameras; usually in a plan of its own (docs/guide/relighting.md).",
+        ("relight_title", "relight"),
+    ),
+    "Advanced": (
+        "Numbers that a quality chooses (docs/guide/quality.md), parts that the plan decides about, and sizes of what comes out.",
+        ("base", "emission", "shading", "components", "render", "metrics", "export", "room", "seed", "device"),
+    ),
+}
+"""Parts of the page after the first: title -> what it holds, and its sections."""
+
+
 def reference_markdown() -> str:
     """Return the settings as a page: key, default, allowed values, meaning (docs/reference/settings.md)."""
     lines = ["# Settings", "", "Made from `workflow/settings/` by `python -m workflow.settings`; do not edit.", ""]
@@ -87,17 +101,24 @@ def reference_markdown() -> str:
         for inner, section in nested_rows:
             rows(section, inner)
 
-    for name, field in SceneSettings.model_fields.items():
+    def section_lines(name: str, field: FieldInfo) -> None:
         if name in UNIONS:
             known: dict[str, str] = {}
             for kind, model in UNIONS[name].items():
-                lines.extend([f"## `{name}: {{kind: {kind}}}`", "", " ".join((model.__doc__ or "").split()), ""])
+                lines.extend([f"### `{name}: {{kind: {kind}}}`", "", " ".join((model.__doc__ or "").split()), ""])
                 rows(model, f"{name}.", kind, known)
         elif isinstance(section := section_in(field.annotation), type) and issubclass(section, Section):
             many = _of_many(field.annotation)
             what = {"[]": " (a list)", ".<name>": " (by name)"}.get(many, "")
-            lines.extend([f"## `{name}`{what}", "", " ".join((section.__doc__ or "").split()), ""])
+            lines.extend([f"### `{name}`{what}", "", " ".join((section.__doc__ or "").split()), ""])
             rows(section, f"{name}{many}.")
         else:
-            lines.extend([f"## `{name}`", "", f"Default `{field.get_default()}`. {field.description or ''}", ""])
+            lines.extend([f"### `{name}`", "", f"Default `{field.get_default()}`. {field.description or ''}", ""])
+
+    advanced = {name: title for title, (_, names) in PARTS.items() for name in names}
+    for title, (about, _) in {FIRST: ("What only you know, or choose.", ()), **PARTS}.items():
+        lines.extend([f"## {title}", "", about, ""])
+        for name, field in SceneSettings.model_fields.items():
+            if advanced.get(name, FIRST) == title:
+                section_lines(name, field)
     return "\n".join(lines)

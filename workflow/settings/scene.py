@@ -23,7 +23,6 @@ _SECTIONS: dict[str, type[Section]] = {
     "base": base.Base,
     "emission": light.Emission,
     "shading": light.Shading,
-    "second_look": base.SecondLook,
     "affines": affines.Affines,
     "render": outputs.Render,
     "metrics": outputs.Metrics,
@@ -34,9 +33,7 @@ _SECTIONS: dict[str, type[Section]] = {
 """Sections to which plug-ins may add fields."""
 EXTENDED = {name: plugins.extended(name, own) for name, own in _SECTIONS.items()}
 """The same with those fields."""
-Capture, Base, Emission, Shading, SecondLook, Affines = (
-    EXTENDED[name] for name in ("capture", "base", "emission", "shading", "second_look", "affines")
-)
+Capture, Base, Emission, Shading, Affines = (EXTENDED[name] for name in ("capture", "base", "emission", "shading", "affines"))
 Render, Metrics, Export, Report, Room = (EXTENDED[name] for name in ("render", "metrics", "export", "report", "room"))
 
 
@@ -55,8 +52,6 @@ class SceneSettings(Section):
     base: Base = Base()
     emission: Emission = Emission()
     shading: Shading = Shading()
-    second_look: SecondLook = SecondLook()
-    """Whether the photographs are looked at again once their light is known."""
     affines: Affines = Affines()
     render: Render = Render()
     metrics: Metrics = Metrics()
@@ -99,7 +94,7 @@ class SceneSettings(Section):
         return self
 
     def implied(self) -> dict[str, dict[str, Any]]:
-        """Return what stages read and other settings decide: section -> key -> plain value."""
+        """Return what stages read and no setting of its own decides: section -> key -> plain value."""
         every = bool(self.affines.of_cells(self.prior.kind)) or self.affines.pixels == "all"
         chosen = self.components
         return {
@@ -109,6 +104,7 @@ class SceneSettings(Section):
                 "pixels": "all" if every else self.affines.pixels,
                 "indirect": {"auto": "auto", "on": "cache", "off": "path"}[chosen.radiance_cache],
             },
+            "second_look": {"enabled": True},
             "affines": {"textured": self.affines.textured(self.prior.kind)},
             "render": {"denoise": chosen.denoiser != "off"},
             "room": {"denoise": chosen.denoiser != "off"},
@@ -141,7 +137,7 @@ def dump(settings: SceneSettings) -> dict[str, Any]:
     among them, with the names of those that are summed from it."""
     document = settings.model_dump(mode="json")
     for section, values in settings.implied().items():
-        document[section] |= values
+        document[section] = {**document.get(section, {}), **values}
     summed = [entry["name"] for entry in document["relight"] if recombines(entry)]
     return {**document, "lamp_images": lamp_bases(document["relight"]), "recombined": summed}
 
@@ -167,9 +163,13 @@ def _added(section: type[Section]) -> dict[str, Any]:
 
 
 def _without_added(section: type[Section] | None, value: Any) -> Any:
-    """Return a dumped section, and the members that it pools, without the fields of plug-ins that are at their defaults."""
-    added = _added(section) if section else {}
+    """Return a dumped section, and all that lies in it, without the fields of plug-ins that are at their defaults."""
+    added, known = (_added(section), section.model_fields) if section else ({}, {})
     out = {name: entry for name, entry in value.items() if name not in added or entry != added[name]}
+    for name in known.keys() & out.keys():
+        inner = section_in(known[name].annotation)
+        if isinstance(out[name], dict) and isinstance(inner, type) and issubclass(inner, Section):
+            out[name] = _without_added(inner, out[name])
     return out | ({"of": [_without_added(POOLED[one["kind"]], one) for one in value["of"]]} if "of" in value else {})
 
 
