@@ -4,4 +4,6 @@ KINDS = {"source": {"extra": ("tests.extra.source", "tests.extra.settings:ExtraS
 SECTIONS = {"base": "tests.extra.settings:Base", "scene": "tests.extra.scene:Scene"}
 STAGES = {"base": "tests.extra.settings:solver"}
 READS = {"base": ("capture.dynamic_range",)}
-ADDED = {"weigh": {"does": "Weigh the room.", "place": "tests.extra.weigh", "upstream": ("capture",), "settings": ("weight", "seed")}}
+ADDED = {
+    "weigh": {"does": "Weigh the room.", "place": "tests.extra.weigh", "upstream": ("capture",), "settings": ("weight", "seed")}
+}
