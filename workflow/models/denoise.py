@@ -20,7 +20,7 @@ def require_denoiser() -> None:
     except (ImportError, OSError) as error:
         raise InputError(
             f"denoise: the package pyoidn (Intel Open Image Denoise) does not load ({error});"
-            " run `bash envs/setup.sh`, or set `components: {{denoiser: off}}`"
+            " run `bash envs/setup.sh`, or set `components: {denoiser: off}`"
         ) from None
 
 
