@@ -598,7 +598,7 @@ def test_denoising_needs_its_package(monkeypatch):
 
     require_denoiser()
     monkeypatch.setitem(sys.modules, "pyoidn", None)
-    with refused("pyoidn", "bash envs/setup.sh", "render.denoise: false"):
+    with refused("pyoidn", "bash envs/setup.sh", "denoiser: off"):
         require_denoiser()
 
 
