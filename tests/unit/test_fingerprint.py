@@ -6,10 +6,11 @@ import shutil
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
 
-from workflow import plugins
+from workflow import plugins, settings
 from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fp
 
@@ -67,7 +68,7 @@ def test_code_edit_changes_only_the_stage_and_below(checkout):
     "module, first", [("iif_core.light.emission.gains", "emission"), ("iif_core.fitting.selection", "affines")]
 )
 def test_a_change_of_a_later_part_does_not_make_earlier_ones_anew(module, first):
-    document = {"source": {"kind": "folder"}, "prior": {"kind": "simulated"}, "segmentation": {"kind": "given"}}
+    document = settings.dump(settings.load("kitchen", "draft", Path(__file__).parents[2]))
     names = list(STAGES)
     earlier = [s for s in names[: names.index(first)] if s != "base_scores"]
     assert earlier and not [s for s in earlier if module in fp.stage_modules(s, document)]
@@ -146,11 +147,12 @@ def test_closure_covers_what_a_stage_really_imports(repository):
         "prior": ("prior", ("learned", "simulated", "files", "retinex", "rgbx", "marigold", "pooled")),
         "segmentation": ("segmentation", ("given", "masks", "geometry")),
     }
+    document = settings.dump(settings.load("kitchen", "draft", repository))
     cases, roots = [], []
     for stage in STAGES:
         section, kinds = kinds_of.get(stage, (None, (None,)))
         for kind in kinds:
-            cases.append((stage, kind, fp.stage_modules(stage, {section: {"kind": kind}} if section else {})))
+            cases.append((stage, kind, fp.stage_modules(stage, document | ({section: {"kind": kind}} if section else {}))))
             roots.append([STAGES[stage].module] + ([plugins.implementation(section, kind)] if section else []))
     command = [sys.executable, "-c", probe, json.dumps(roots)]
     out = subprocess.run(command, cwd=repository, capture_output=True, text=True)

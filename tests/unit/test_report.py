@@ -32,6 +32,7 @@ from workflow.runtime.timings import read_timings
 from workflow.scene.cached_light import SpecularLight, table_of
 from workflow.scene.normal_form import CaptureReader, CaptureWriter, Truth, View
 from workflow.scene.recovered import read_recovered, read_response, response_samples
+from workflow.scoring.of_views import PredictionMeans
 from workflow.stages import export, metrics, publish, render, report, room, unwrap
 
 BOX = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.float32)
@@ -386,7 +387,7 @@ def test_object_mean_is_the_mean_of_the_predictions(toy):
     job = FakeJob("metrics", toy / "again")
     job.root = toy
     capture = CaptureReader(job.read("capture"))
-    means = metrics._PredictionMeans(job, capture.views)
+    means = PredictionMeans(job, capture.views)
     total, count = np.zeros(3), 0
     for view in capture.views:
         channels = job.read("prior").exr(f"maps/{view.name}.exr")
