@@ -73,8 +73,15 @@ def quality(wildcards):
 def image(wildcards):
     """The image that jobs run in; none without `--sdm apptainer`, because Snakemake refuses an image with a space in its path
     even where it does not read it."""
-    methods = map(str, workflow.deployment_settings.deployment_method)
-    return f"{CHECKOUT}/envs/iif.sif" if "apptainer" in methods else None
+    if "apptainer" not in map(str, workflow.deployment_settings.deployment_method):
+        return None
+    path = f"{CHECKOUT}/envs/iif.sif"
+    if " " in path:
+        stop(
+            f"{path}: Snakemake does not read an image with a space in its path. Move the checkout to a folder without spaces,"
+            " or leave out `--sdm apptainer`."
+        )
+    return path
 
 
 wildcard_constraints:
@@ -263,12 +270,12 @@ def scored_inputs(wildcards):
     """What maps are scored against; without maps the run stops here, before any job."""
     folder_or_stop(f"score/{wildcards.scene}")
     folder = str(config.get("maps", ""))
+    holds = "the folder that holds albedo/<view>.exr or .png, roughness/, metallic/ and so on (docs/guide/comparing.md)"
+    if not folder:
+        stop(f"score/{wildcards.scene}: whose maps? Add --config maps=<folder> with {holds}")
     if not os.path.isdir(folder):
-        hint = did_you_mean_path(Path(folder)) if folder else ""
-        stop(
-            f"--config maps={folder}: no such folder; a relative path counts from {os.getcwd()}.{hint} Give the"
-            " folder that holds albedo/<view>.exr or .png, roughness/, metallic/ and so on (docs/guide/comparing.md)"
-        )
+        hint = did_you_mean_path(Path(folder))
+        stop(f"--config maps={folder}: no such folder; a relative path counts from {os.getcwd()}.{hint} Give {holds}")
     return {name: manifest(name, wildcards.scene) for name in ("capture", "segmentation")}
 
 

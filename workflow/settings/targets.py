@@ -45,7 +45,7 @@ def _meant(target: str, scenes: list[str], rules: list[str]) -> str:
         other = next((scene for scene in scenes if scene not in parts[1:]), "other")
         return f" It needs the names of two results, such as compare/{parts[-1] if len(parts) > 1 else 'kitchen'},{other}."
     if parts[:2] == ("results", "studies"):
-        return " Studies have their own Snakefile, see lab/docs/studies.md."
+        return " Studies have a Snakefile to themselves."
     if parts[0] == "results" and len(parts) > 2:
         stages = [f"results/{parts[1]}/{stage}/manifest.json" for stage in STAGES if stage != "publish"]
         same = [path for path in stages if Path(path).parts[2] == parts[2]]
@@ -53,4 +53,5 @@ def _meant(target: str, scenes: list[str], rules: list[str]) -> str:
     if parts[0] in FOLDERS and len(parts) > 1 and parts[1] in scenes:
         return f" Did you mean {parts[0]}/{parts[1]}?"
     known = [f"{folder}/{scene}" for folder in FOLDERS for scene in scenes]
-    return did_you_mean(target, rules) or did_you_mean(target, known) or did_you_mean(target, scenes, "scenes/{}")
+    nearest = did_you_mean(target, known) if len(parts) > 1 else did_you_mean(target, rules)
+    return nearest or did_you_mean(target, [*known, *rules]) or did_you_mean(target, scenes, "scenes/{}")
