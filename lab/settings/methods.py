@@ -91,6 +91,8 @@ class Emission(light.Emission):
     """`published`: steps of 8192 pixels each; default: one pass over all pixels."""
     cache_edge: float = Field(EmissionOptions.cache_edge, gt=0)
     """Edge of a radiance-cache voxel in metres."""
+    min_observations: int = Field(EmissionOptions.min_observations, ge=1)
+    """Pixels that must show a face or a group of faces before it can be an emitter."""
 
 
 class Shading(light.Shading):

@@ -80,10 +80,10 @@ def found(source: dict[str, Any], points: bool = False, **capture: Any) -> None:
             images.load_mask(frame.mask, frame.turn, frame.mask_full)
         if frame.depth:
             images.load_depth(frame.depth, inputs.transforms.depth_unit)
-        for path in inputs.truth.get(frame.name, {}).values():
+        for path in (frame.truth or {}).values():
             images.load_map(path, 3)
-        if frame.name in inputs.instances:
-            inputs.load_ids(inputs.instances[frame.name], frame.turn)
+        if frame.ids:
+            inputs.load_ids(frame.ids, frame.turn)
     load_mesh(inputs.mesh, inputs.metres, inputs.of_vertices() if inputs.of_vertices else None, tree, inputs)
     if inputs.exposures:
         from workflow.sources.folder_scene import exposure

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from lab.packing import pack
+from lab.settings.capture import Capture
 from lab.settings.source import BuiltinSource
 from lab.sources import builtin
 from tests.errors import refused
 from workflow.artifacts.store import StageReader, StageWriter
 from workflow.scene.normal_form import CaptureReader
-from workflow.settings.source import Capture, FolderSource
+from workflow.settings.source import FolderSource
 from workflow.sources import folder
 
 VIEWS = {"views": 4, "width": 32, "height": 24, "samples": 4, "test_every": 4}

@@ -135,7 +135,7 @@ def test_scales_learn_the_mean_error_of_every_head(batch, predicted):
 
 def test_weights_of_other_layers_are_refused():
     own = PriorNetwork(len(CHANNELS), (8, 16), 2)
-    for widths, layer in (((8, 16, 16), "down.2.c1.weight"), ((8, 8), "down.1.c1.weight")):
+    for widths, layer in (((8, 16, 16), "down.2.c1.weight"), ((8, 8), "down.1.skip.weight")):
         other = PriorNetwork(len(CHANNELS), widths, 2)
         with refused(layer, kind=ValueError):
             network.load_weights(own, other.state_dict())

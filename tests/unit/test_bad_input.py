@@ -1095,6 +1095,6 @@ def test_every_example_of_the_guide_is_valid():
     guide = (PAGE.parents[2] / "docs/guide/own-data.md").read_text()
     examples = re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL)
     kinds = {settings.SceneSettings.model_validate(yaml.safe_load(text)).source.kind for text in examples}
-    assert kinds == {"builtin", "mitsuba", "folder", "scannetpp", "fipt"}
+    assert kinds == {"folder", "scannetpp", "fipt"}
     matrix = json.loads(re.search(r"```json\n(.*?)```", guide, re.DOTALL)[1])["frames"][0]["transform_matrix"]
     assert np.linalg.det(np.array(matrix)[:3, :3]) == pytest.approx(1, abs=0.02)

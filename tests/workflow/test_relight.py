@@ -87,7 +87,7 @@ def test_plans_stand_beside_the_relightings_of_a_scene(workflow):
     (folder / "plan/half/frame_0000.png").unlink()
     assert planned(workflow.run("relight/tiny/plan", "-n")) == {"relit_plan"}
     both = workflow.run("relight/tiny", "relight/tiny/plan", "-n")
-    named(error_of(both), "`relight/tiny`", "relight/tiny/plan")
+    named(error_of(both), "`relight/tiny`")
     unknown = workflow.run("relight/tiny/plna", "-n")
     named(error_of(unknown), "config/relight/plna.yaml", "plan")
     workflow.write("small", (workflow.folder / "config/scenes/tiny.yaml").read_text())
