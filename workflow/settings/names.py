@@ -62,7 +62,8 @@ def _scene_folders(root: Path) -> list[Path]:
 def scene_path(scene: str, root: Path = Path(".")) -> Path:
     """Return where the file of a scene lies, or would lie."""
     paths = [folder / f"{scene}.yaml" for folder in _scene_folders(root)]
-    return next((path for path in paths if path.is_file()), paths[0])
+    # Not `Path.is_file`, which raises where a name is longer than a file system takes.
+    return next((path for path in paths if os.path.isfile(path)), paths[0])
 
 
 def scene_names(root: Path = Path(".")) -> list[str]:
