@@ -199,15 +199,15 @@ def _load_study(path: Path, file: Path, root: Path, _stamp: int) -> Study:
 
 def _check_trajectories(design: Design, path: Path) -> None:
     """Refuse runs that are no trajectories: steps of one factor by two of four levels, each factor once."""
+    odd = [name for name, levels in design.factors.items() if len(levels) != MORRIS_LEVELS]
+    if odd:
+        raise InputError(f"{path}: `design.factors`: {', '.join(odd)}: trajectories need {MORRIS_LEVELS} levels of each factor")
     whole = len(design.factors) + 1
     if len(design.runs) < design.trajectories * whole:
         raise InputError(
             f"{path}: `design.trajectories`: found {design.trajectories}, which are {design.trajectories * whole} runs;"
             f" there are {len(design.runs)}. lab/docs/studies.md says what makes them"
         )
-    odd = [name for name, levels in design.factors.items() if len(levels) != MORRIS_LEVELS]
-    if odd:
-        raise InputError(f"{path}: `design.factors`: {', '.join(odd)}: trajectories need {MORRIS_LEVELS} levels of each factor")
     runs = design.runs[: design.trajectories * whole]
     for number in range(0, len(runs) - whole + 1, whole):
         one = runs[number : number + whole]

@@ -309,7 +309,7 @@ def test_a_file_is_never_written_through_a_link(tmp_path, monkeypatch):
     log.symlink_to(outside)
     root = logging.getLogger()
     monkeypatch.setattr(root, "handlers", [])
-    with refused(log, outside):
+    with refused(log):
         configure_logging(log)
     assert outside.read_text() == "mine"
 

@@ -59,9 +59,8 @@ def test_a_device_that_cannot_trace_rays(monkeypatch, caplog):
     assert device.use("cpu").kind == "cpu" and not caplog.text
 
 
-CHOOSERS = {"runtime/device.py", "runtime/doctor.py", "exporters/mitsuba_render.py", "sources/mitsuba_scene/trial.py"}
-"""The last three are separate programs: a probe in a child process, what is exported next to scene.xml, and the loading of a
-scene that may end its process."""
+CHOOSERS = {"runtime/device.py", "runtime/doctor.py", "exporters/mitsuba_render.py"}
+"""The last two are separate programs: a probe in a child process, and what is exported next to scene.xml."""
 
 
 def test_nothing_else_chooses_a_variant():

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from workflow.artifacts import sound, stamps
-from workflow.artifacts.files import write_json
+from workflow.artifacts.files import sha256_of, write_json
 from workflow.artifacts.manifest import SCENE_SCHEMA
 from workflow.batch import standing, status
 from workflow.runtime import fingerprint as fp
@@ -242,7 +242,7 @@ def test_a_file_of_a_deliverable_that_was_changed_is_told(project):
     path = Path("scenes/a/verdict.json")
     path.parent.mkdir(parents=True)
     path.write_text("{}")
-    published(files={"verdict.json": {}})
+    published(files={"verdict.json": {"sha256": sha256_of(path), "bytes": 2}})
     assert (stand().state, stand().reason) == ("done", "")
     path.write_text("[]")
     assert stand().state == "stale" and stand().reason.startswith("scenes/a/")

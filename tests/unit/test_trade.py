@@ -91,7 +91,7 @@ def test_a_target_follows_what_was_measured_in_the_room(table, tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("config", "words"),
     [
-        ({"qualty": "draft"}, ["qualty: unknown key. Did you mean quality?", "Allowed: quality, inputs, maps, colour"]),
+        ({"qualty": "draft"}, ["qualty: unknown key. Did you mean quality?", "Allowed: quality, maps, colour"]),
         ({"budget": 120}, ["there is no `budget` any more; write --config quality=120s"]),
         ({"quality": "draft", "target": "held_out:24"}, ["no `target` any more; write --config quality=held_out:24"]),
         ({"point": "p05"}, ["no `point` any more; write --config quality=p05"]),
