@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iif_core.light.base_scene import Light
-from iif_core.light.lamps import Lamp, lamps_of
 from iif_core.light.relighting import sphere_mesh
+from lab.relit.lamps import Lamp, lamps_of
 from workflow.runtime import device
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import Recovered

@@ -12,7 +12,7 @@ import numpy as np
 from iif_core.camera.pinhole import direction_derivatives
 from iif_core.errors import InputError
 from iif_core.evaluation.metrics import Score
-from iif_core.light.lamps import match_faces
+from lab.relit.lamps import match_faces
 from lab.relit.measures import METRICS, RelitTarget
 from lab.relit.new_light import NewLight, relit_world, source_lamps
 from workflow.artifacts.store import rgb, split_rgb

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from iif_core.errors import InputError
-from iif_core.light.lamps import Lamp
 from iif_core.light.relighting import frame_times
+from lab.relit.lamps import Lamp
 from lab.relit.measures import exposure_of
 from lab.relit.new_light import Ball, NewLight, source_lamps
 from lab.relit.sources import open_room

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from iif_core.light.lamps import lamps_of, match_faces
 from lab.relit import scores as relit_scores
+from lab.relit.lamps import lamps_of, match_faces
 from lab.relit.measures import RelitTarget, best_gain, exposure_of, relative_error
 from lab.relit.new_light import Ball, NewLight
 from tests.errors import refused

@@ -5,8 +5,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from support import Workflow
+from support import Workflow, error_of
 
+from tests.errors import named
 from workflow.registry import STAGES
 
 
@@ -109,6 +110,14 @@ def test_a_target_that_nothing_makes_is_one_error(fresh, arguments, found, meant
 def test_status_is_asked_without_snakemake(fresh):
     result = fresh.run("status", "-n")
     assert result.returncode == 1 and "Ask `python -m workflow status`" in result.stderr.strip().splitlines()[-1]
+
+
+def test_a_profile_that_is_not_there_is_one_error(fresh, monkeypatch):
+    """Snakemake passes over it, and a run that was meant for a cluster would compute where it was called."""
+    monkeypatch.setenv("PWD", os.getcwd())
+    result = fresh.run("scenes/tiny", "-n", "--workflow-profile", "workflow/profiles/slurm-scene")
+    assert result.returncode == 1
+    named(error_of(result), "--workflow-profile workflow/profiles/slurm-scene", os.getcwd(), "workflow/profiles/slurm-scenes")
 
 
 @pytest.mark.parametrize("target", ["plan/tiny", "relight/tiny"])

@@ -10,6 +10,8 @@ from pathlib import Path
 CHECKOUT = str(Path(workflow.current_basedir).parents[1])
 sys.path.insert(0, CHECKOUT)
 
+from snakemake.cli import get_argument_parser
+
 from iif_core.errors import InputError
 from workflow.artifacts import links, sound
 from workflow.batch import causes
@@ -21,7 +23,7 @@ from workflow.relighting.check import check_relightings
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import forecast, native
 from workflow.runtime.job_state import written_out
-from workflow.settings import SCENE_NAME, refuse_target, scene_file, study_files
+from workflow.settings import SCENE_NAME, refuse_profile, refuse_target, scene_file, study_files
 from workflow.settings import prior as prior_settings
 from workflow.settings.names import did_you_mean_path
 from workflow.trade import bench, choose
@@ -52,6 +54,19 @@ for place in (".", "results", "scenes", ".snakemake"):
             f"{os.path.realpath(place)}: not writable for you; results and records are written there."
             " Give yourself the right, or work in a copy of the checkout."
         )
+
+
+def profile_or_stop():
+    """Refuse a workflow profile that is not there. Snakemake read it in the folder where it was called, and with `--directory` it is
+    in another one now, and does not say which that was; the shell does."""
+    given = get_argument_parser().parse_args()
+    start = os.environ.get("PWD", FOLDER) if given.directory else FOLDER
+    or_stop(refuse_profile, given.workflow_profile, Path(start), Path(CHECKOUT))
+
+
+# Only where there is something to check: Snakemake takes half a second to read its arguments.
+if workflow.is_main_process and any(word.startswith("--workflow-p") for word in sys.argv):
+    profile_or_stop()
 
 # `--config quality=...`: a quality by name, or for each scene the one that a number of seconds or a score asks for.
 REQUEST = or_stop(choose.read, config, workflow.resource_settings.cores)

@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from iif_core.camera.gains import CameraGains
-from iif_core.camera.pixels import ViewPixels
 from iif_core.camera.response import SATURATION
 from iif_core.light.base_scene import BaseScene, Light
 from iif_core.reflectance.material import CHANNELS, NEUTRAL
 from iif_core.surface.triangles import face_geometry
 from workflow.artifacts.store import StageReader, rgb
 from workflow.runtime.job import Job
-from workflow.scene.decoded import DecodedViews
 from workflow.scene.normal_form import CaptureReader, View
 
 if TYPE_CHECKING:
@@ -75,11 +73,6 @@ def sensor_bounds(value: np.ndarray, is_hdr: bool) -> tuple[np.ndarray, np.ndarr
     if is_hdr:
         return value, np.zeros(value.shape, bool)
     return np.minimum(value, SATURATION), value >= SATURATION
-
-
-def view_pixels(job: Job, capture: CaptureReader, scene: BaseScene, view: View) -> ViewPixels:
-    """Collect the pixels of a view that hit the mesh, once; `DecodedViews` is for several passes."""
-    return DecodedViews(capture, job.read("segmentation"), 0).pixels(view, scene.normals)
 
 
 def base_maps(job: Job, view: View) -> np.ndarray:

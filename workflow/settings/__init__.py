@@ -14,7 +14,7 @@ from workflow.settings.relight import relight_files, require_relighting
 from workflow.settings.relight_plans import active_plan, plan_names
 from workflow.settings.scene import UNIONS, SceneSettings, dump, recorded, select
 from workflow.settings.section import Section
-from workflow.settings.targets import refuse_target
+from workflow.settings.targets import refuse_profile, refuse_target
 from workflow.settings.yaml_file import read_yaml
 
 __all__ = [
@@ -32,6 +32,7 @@ __all__ = [
     "recorded",
     "plan_schema_json",
     "reference_markdown",
+    "refuse_profile",
     "refuse_target",
     "relight_files",
     "relight_origin",

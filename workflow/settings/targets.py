@@ -1,14 +1,15 @@
-"""What an unknown target was probably meant to be."""
+"""What an unknown target or profile was probably meant to be."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
 from iif_core.errors import InputError
 from workflow.registry import STAGES
 from workflow.settings import batch_table
-from workflow.settings.names import did_you_mean, scene_names
+from workflow.settings.names import did_you_mean, did_you_mean_path, scene_names
 
 FOLDERS = ("scenes", "plan", "bench", "relight", "score")
 """Folders of targets that are named after one scene."""
@@ -32,6 +33,29 @@ def refuse_target(target: str, rules: Iterable[str], root: Path = Path(".")) -> 
         " name of one scene (letters, digits, _ and -), relight/<name>/<plan> with a plan of config/relight/, score/<name>,"
         " compare/<a>,<b> with the names of two results, results/<name>/<stage>/manifest.json, `scenes` and `verify`;"
         " docs/reference/commands.md lists them, and `snakemake --list` the rules that `--forcerun` takes."
+    )
+
+
+def refuse_profile(given: str, start: Path, checkout: Path) -> None:
+    """Refuse a `--workflow-profile` that is not there, which Snakemake passes over without a word.
+
+    Args:
+        given: as written on the command line.
+        start: the folder that it was written in.
+        checkout: folder of the Snakefile.
+
+    Raises:
+        InputError: there is no such profile at any place where Snakemake looks.
+    """
+    places = (start / given, start / "profiles" / given, checkout / "profiles" / given)
+    if given == "none" or any(path.exists() for path in places):
+        return
+    ours = sorted(path.parent for path in checkout.glob("workflow/profiles/*/*.yaml"))
+    named = [os.path.relpath(path, start) if path.is_relative_to(start) else str(path) for path in ours]
+    hint = did_you_mean(given, named) or did_you_mean_path(start / given)
+    raise InputError(
+        f"--workflow-profile {given}: not found; a relative path counts from {start}.{hint} Those of the workflow are"
+        f" {', '.join(named)}."
     )
 
 

@@ -30,7 +30,8 @@ from lab.published.state import keep_state, kept_state
 from workflow.decisions import light as decisions
 from workflow.runtime import device
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import read_base_scene, view_pixels
+from workflow.scene.base_scene import read_base_scene
+from workflow.scene.decoded import DecodedViews
 from workflow.scene.emission_views import gain_plan, view_exposures
 from workflow.scene.light_files import emitter_columns, write_light
 from workflow.scene.normal_form import CaptureReader, View
@@ -119,13 +120,13 @@ def _read(
     views, faces = capture.used, len(scene.faces)
     low, high = np.inf, -np.inf
     for view in views:
-        points = view_pixels(job, capture, scene, view).points
+        points = DecodedViews(capture, job.read("segmentation"), 0).pixels(view, scene.normals).points
         low, high = min(low, float(points.min(initial=np.inf))), max(high, float(points.max(initial=-np.inf)))
     corner, edge = bounding_cube(low, high) if np.isfinite(low) else (0.0, 1.0)
     sums, total, count = RadianceSums(edge, np.full(3, corner, np.float32)), np.zeros((faces, 3)), np.zeros(faces)
     parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for number, view in enumerate(views):
-        pixels = view_pixels(job, capture, scene, view)
+        pixels = DecodedViews(capture, job.read("segmentation"), 0).pixels(view, scene.normals)
         pixels = pixels.take(np.flatnonzero(pixels.valid))
         shown = np.clip(pixels.value, 0, 1)
         radiance = curve.inverse(shown) / exposure[number]

@@ -11,8 +11,9 @@ from workflow.artifacts.store import split_rgb
 from workflow.models.denoise import denoise_alone, require_denoiser
 from workflow.runtime import device
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import read_lit_scene, read_radiance_cache, view_pixels
+from workflow.scene.base_scene import read_lit_scene, read_radiance_cache
 from workflow.scene.cached_light import UNITS, SpecularLight, table_of
+from workflow.scene.decoded import DecodedViews
 from workflow.scene.normal_form import CaptureReader, View
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def run(job: Job) -> None:
     for done, view in enumerate(capture.views):
         job.progress(done, len(capture.views), "views cached")
         if job.writer.part_kept(view.name) is None:
-            _view(job, world, levels, view, view_pixels(job, capture, scene, view))
+            _view(job, world, levels, view, DecodedViews(capture, job.read("segmentation"), 0).pixels(view, scene.normals))
         count += len(job.writer.columns(table_of(view))["index"])
     job.writer.table("levels.parquet", {"level": np.arange(LEVELS, dtype=np.int32), "roughness": levels})
     facts = {"cells": 0, "cell_edge_m": scene.cell_edge, "paths_per_pixel": DIFFUSE_PATHS}
