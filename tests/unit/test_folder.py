@@ -11,12 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from iif_core.camera.distortion import Distortion, pinhole_inside
 from iif_core.errors import InputError
-from tests.errors import missing, named, refused
+from iif_core.surface.axes import turn_of
+from tests.errors import misset, missing, named, refused
 from tests.unit import own_scene as own
 from workflow.artifacts import StageReader
 from workflow.exporters.camera_files import cameras_json
 from workflow.exporters.glb import rotation_to_y
 from workflow.scene.normal_form import View
+from workflow.settings.source import FolderSource
 from workflow.sources import folder
 from workflow.sources.folder_scene import alignment, images, mesh, transforms
 
@@ -463,12 +465,32 @@ def test_mesh_turned_against_the_poses_is_named(tmp_path):
     path = own.project(tmp_path)
     own.photographed(path)
     vertices, faces, _ = own.room_mesh()
-    own.save_mesh(path / "mesh.ply", vertices @ mesh.TURNS["z"].T, faces)  # as a glTF exporter turns it
+    own.save_mesh(path / "mesh.ply", vertices @ turn_of("x z -y").T, faces)  # as a glTF exporter turns it
     assert proposed(fails(tmp_path)) == ["mesh_up: y", "alignment: warn"]
     own.project(tmp_path, {"mesh_up": "y"})
     np.testing.assert_allclose(own.run(tmp_path, "capture").mesh()[0], vertices, atol=1e-5)
     own.save_mesh(path / "mesh.ply", vertices, faces)
     assert proposed(fails(tmp_path)) == ["mesh_up: as_poses", "alignment: warn"]
+
+
+def test_any_quarter_turn_of_the_mesh_is_named_and_undone(tmp_path):
+    """Phone apps write a mesh with y up; converters of their poses move each axis to the next."""
+    path = own.project(tmp_path)
+    own.photographed(path)
+    vertices, faces, _ = own.room_mesh()
+    own.save_mesh(path / "mesh.ply", vertices @ turn_of("y z x").T, faces)
+    assert proposed(fails(tmp_path))[0] == "mesh_up: z x y"
+    own.project(tmp_path, {"mesh_up": "z x y"})
+    np.testing.assert_allclose(own.run(tmp_path, "capture").mesh()[0], vertices, atol=1e-5)
+    # A wrong turn: the right one is named, not the one from the wrong to the right.
+    own.project(tmp_path, {"mesh_up": "y"})
+    assert proposed(fails(tmp_path))[0] == "mesh_up: z x y"
+
+
+@pytest.mark.parametrize("mesh_up", ["z x", "x x y", "y x z", "x y w", ""])
+def test_what_is_no_turn_of_the_mesh_is_refused(mesh_up):
+    with misset("mesh_up", "value_error", "as_poses"):
+        FolderSource(kind="folder", path="data/room", mesh_up=mesh_up)
 
 
 def test_a_finished_scene_fits_itself(tmp_path):

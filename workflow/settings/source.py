@@ -7,8 +7,18 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
+from iif_core.errors import InputError
+from iif_core.surface.axes import AS_IS, turn_of
 from workflow import plugins
 from workflow.settings.section import ON_OFF, Section
+
+MESH_UP = {"as_poses": AS_IS, "y": "x -z y", "z": "x z -y"}
+"""Words of `source.mesh_up` -> the axes of the poses, as axes of the mesh file."""
+
+
+def mesh_axes(mesh_up: str) -> str:
+    """Return the axes of the poses, as axes of the mesh file, of a value of `source.mesh_up`."""
+    return MESH_UP.get(mesh_up, mesh_up)
 
 
 class PhotographedSource(Section):
@@ -18,9 +28,18 @@ class PhotographedSource(Section):
     registration: Annotated[Literal["auto", "off"], ON_OFF] = "auto"
     """`auto`: correct poses, focal length and principal point by the mesh and the other photographs, if held-out surface confirms
     the correction, and leave out blurred and badly posed photographs. `off`: use them as given."""
-    mesh_up: Literal["as_poses", "y", "z"] = "as_poses"
-    """Which axis is up in the mesh file, where it is another than in the poses: `y` turns the mesh to z-up (x, -z, y), as a GLB
-    of a room with z up needs it; `z` turns it to y-up (x, z, -y)."""
+    mesh_up: Literal["as_poses", "y", "z"] | str = "as_poses"
+    """How the mesh file is turned against the poses: `y`: it has y up and they have z up (as a GLB of a room with z up), `z`: the
+    other way round. Any other quarter turn: the x, y and z of the poses, as axes of the mesh file, such as `z x y`."""
+
+    @field_validator("mesh_up")
+    @classmethod
+    def _names_a_turn(cls, value: str) -> str:
+        try:
+            turn_of(mesh_axes(value))
+        except InputError as error:
+            raise ValueError(f"{error}, or one of {', '.join(MESH_UP)}") from None
+        return value
 
 
 class FolderSource(PhotographedSource):

@@ -17,6 +17,7 @@ from iif_core.camera.registration import Photo
 from iif_core.errors import InputError
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureWriter, View
+from workflow.settings.source import mesh_axes
 from workflow.sources.folder_scene import alignment, exposure, images, mesh, notes, photographs, registration, transforms
 from workflow.sources.folder_scene.inputs import Inputs, find_inputs
 from workflow.sources.folder_scene.photographs import Photograph, photograph, pinhole, view_of
@@ -47,7 +48,7 @@ def capture(job: Job) -> None:
 def capture_photographs(job: Job, inputs: Inputs) -> None:
     """Write the normal form of photographs with known cameras and a mesh, whichever source found them."""
     source, settings, frames = job.settings.source, job.settings.capture, inputs.transforms.frames
-    conventions = alignment.Conventions(inputs.transforms.axes, inputs.metres, mesh_up=source.mesh_up)
+    conventions = alignment.Conventions(inputs.transforms.axes, inputs.metres, mesh_axes=mesh_axes(source.mesh_up))
     poses = [conventions.pose(frame) for frame in frames]
     surface = _mesh(inputs, source, poses)
     said = [*inputs.transforms.notes, *surface.notes]
@@ -141,7 +142,7 @@ class _Taken:
 
 def _mesh(inputs: Inputs, source: Any, poses: Sequence[np.ndarray]) -> mesh.Mesh:
     of_vertices = inputs.of_vertices() if inputs.of_vertices else None
-    found = mesh.load(inputs.mesh, inputs.metres, of_vertices, source.mesh_up)
+    found = mesh.load(inputs.mesh, inputs.metres, of_vertices, mesh_axes(source.mesh_up))
     centres = np.array([pose[:3, 3] for pose in poses])
     mesh.check_size(inputs.mesh, found, getattr(source, "unit", "m"), inputs.metres, centres)
     if found.from_nodes and any(frame.ids for frame in inputs.transforms.frames):

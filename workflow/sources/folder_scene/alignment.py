@@ -13,8 +13,9 @@ import numpy as np
 from iif_core.camera.distortion import Pinhole, undistort
 from iif_core.camera.pinhole import pixel_directions, project
 from iif_core.errors import InputError
+from iif_core.surface.axes import AS_IS, TURNS, name_of, turn_of
+from workflow.settings.source import MESH_UP
 from workflow.sources.folder_scene import images
-from workflow.sources.folder_scene.mesh import TURNS
 from workflow.sources.folder_scene.transforms import METRES, Frame, opencv_pose
 
 TOLERANCE = 0.05  # largest accepted median relative difference of depth, where depth images or sparse points exist
@@ -47,14 +48,14 @@ class Conventions:
         metres: per unit.
         change: applied to the matrix before; None = identity.
         of_world: whether `change` concerns the world, and thus also the depth images' own poses and the sparse points.
-        mesh_up: `source.mesh_up`, as which the mesh was read.
+        mesh_axes: axes of the poses, as axes of the mesh file, by which the mesh was turned when it was read.
     """
 
     axes: str
     metres: float
     change: Callable[[np.ndarray], np.ndarray] | None = None
     of_world: bool = False
-    mesh_up: str = "as_poses"
+    mesh_axes: str = AS_IS
 
     def pose(self, frame: Frame) -> np.ndarray:
         """Return `world_from_camera` of the photograph."""
@@ -153,6 +154,11 @@ def _moved(factor: float) -> Callable[[np.ndarray], np.ndarray]:
     return lambda matrix: np.concatenate([matrix[:, :3], matrix[:, 3:] * [[factor], [factor], [factor], [1]]], 1)
 
 
+def _word(axes: str) -> str:
+    """Return what `source.mesh_up` calls a turn."""
+    return next((word for word, named in MESH_UP.items() if named == axes), axes)
+
+
 def candidates(now: Conventions, known: bool) -> list[tuple[str, Conventions]]:
     """Return other conventions than `now`, each with the advice that applies it; `known`: the format of the file determines the
     axes."""
@@ -165,12 +171,12 @@ def candidates(now: Conventions, known: bool) -> list[tuple[str, Conventions]]:
         (f"{inverse} with `source.axes: {other}` fits", Conventions(other, metres, np.linalg.inv)),
     ]
     out = [] if known else of_camera
-    for up, words in (("y", "from y-up to z-up (x, -z, y)"), ("z", "from z-up to y-up (x, z, -y)")):
-        text = f"`source.mesh_up: {up}`, which turns the mesh {words}, fits"
-        if now.mesh_up != "as_poses":  # it is turned already: this turns it back
-            text = "`source.mesh_up: as_poses` fits"
-        if now.mesh_up != up:
-            out.append((text, Conventions(axes, metres, _turned(TURNS[up].T), of_world=True)))
+    read = turn_of(now.mesh_axes)
+    for name in TURNS:
+        further = turn_of(name)  # of the mesh as it was read; turning the poses back is the same
+        if name != AS_IS:
+            advice = f"`source.mesh_up: {_word(name_of(further @ read))}`, which turns the mesh, fits"
+            out.append((advice, Conventions(axes, metres, _turned(further.T), of_world=True)))
     for factor in (1000.0, 100.0, 0.01, 0.001):
         text = f"camera positions times {factor:g} fits (mesh and poses are in different units)"
         out.append((text, Conventions(axes, metres, _moved(factor), of_world=True)))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
+from iif_core.surface.axes import AS_IS, turn_of
 from iif_core.surface.triangles import face_geometry
 from workflow.intake import limits
 from workflow.intake.documents import check_file, reading
@@ -25,12 +26,6 @@ DIAGONAL = (0.5, 200.0)  # metres; a room outside of this range is in another un
 FACTORS = (0.1, 0.01, 0.001)
 """Factors on camera positions far away that are tried: decimetres, centimetres and millimetres, in addition to metres."""
 LEAST_SPREAD = 0.05  # of the scene's size; cameras nearer to one another lie in the mesh by any small factor
-TURNS = {
-    "as_poses": np.eye(3),
-    "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-    "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-}
-"""`source.mesh_up` -> rotation from the axes of the mesh file to those of the poses."""
 MAX_UNUSED = 0.05
 """Share of the vertices of an OBJ file that may belong to no face; one that is cut short has vertices first, and then part of the
 faces."""
@@ -136,12 +131,12 @@ class VertexIds:
     path: Path
 
 
-def load(path: Path, metres: float, of_vertices: VertexIds | None = None, up: str = "as_poses") -> Mesh:
+def load(path: Path, metres: float, of_vertices: VertexIds | None = None, axes: str = AS_IS) -> Mesh:
     """Read a mesh (PLY, OBJ or GLB), merge its nodes, scale it to metres, turn it, remove faces without area, keep `instance` of
     the faces.
 
-    `metres` is the unit of the file; `of_vertices` are ids from another file, which replace those of the mesh; `up`: a key of
-    `TURNS`.
+    `metres` is the unit of the file; `of_vertices` are ids from another file, which replace those of the mesh; `axes`:
+    those of the poses, as axes of the file (`turn_of`).
 
     Raises:
         InputError: unreadable, no triangles, none with an area, or instance ids that do not fit.
@@ -158,7 +153,7 @@ def load(path: Path, metres: float, of_vertices: VertexIds | None = None, up: st
                 " from the same release"
             )
         ids, names = majority_id(of_vertices.ids[faces]), None
-    mesh = _cleaned(path, vertices * metres @ TURNS[up].T, faces, ids)
+    mesh = _cleaned(path, vertices * metres @ turn_of(axes).T, faces, ids)
     if names is not None:
         mesh.names, mesh.from_nodes = names, True
     elif mesh.instance is not None:
