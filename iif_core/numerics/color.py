@@ -15,6 +15,12 @@ Array = np.ndarray
 REC709_LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Weights of linear R, G, B in luminance (ITU-R BT.709)."""
 
+REC709_PRIMARIES = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06), (0.3127, 0.3290))
+"""CIE x, y of red, green, blue and white of linear Rec. 709, the primaries of sRGB, which every colour here is taken to have."""
+
+_BRADFORD = ((0.8951, 0.2664, -0.1614), (-0.7502, 1.7135, 0.0367), (0.0389, -0.0685, 1.0296))
+"""Cone responses of CIE XYZ, in which one white is turned into another (Lindbloom, after Lam 1985)."""
+
 SRGB_KNEE = 0.0031308
 """Linear value below which the sRGB curve is a straight line, 12.92 x (IEC 61966-2-1)."""
 
@@ -43,6 +49,40 @@ def linear_from_srgb(y: ArrayLike) -> Array:
     size = np.abs(y)
     high = ((np.maximum(size, 0.04045) + 0.055) / 1.055) ** 2.4
     return np.copysign(np.where(size <= 0.04045, size / 12.92, high), y).astype(y.dtype)
+
+
+def rec709_from_primaries(primaries: ArrayLike) -> Array:
+    """Compute the matrix from linear colours of other primaries to linear Rec. 709.
+
+    XYZ = P diag(P^-1 w) rgb, with the columns of P the XYZ of the primaries at luminance 1 and w that of white; white is adapted by
+    Bradford's cone responses (SMPTE RP 177; Lindbloom).
+
+    Args:
+        primaries: (4, 2) CIE x, y of red, green, blue and white.
+
+    Returns:
+        (3, 3) float64; rows sum to 1, so that white stays white.
+
+    Raises:
+        InputError: primaries on one line, or y = 0.
+    """
+    to_xyz, white = _xyz_of(primaries)
+    of_rec709, target = _xyz_of(REC709_PRIMARIES)
+    cones = np.asarray(_BRADFORD)
+    adapt = np.linalg.inv(cones) @ np.diag((cones @ target) / (cones @ white)) @ cones
+    return np.linalg.inv(of_rec709) @ adapt @ to_xyz
+
+
+def _xyz_of(primaries: ArrayLike) -> tuple[Array, Array]:
+    """Return XYZ of linear red, green and blue as columns (3, 3), and that of white (3,), at luminance 1."""
+    xy = np.asarray(primaries, np.float64)
+    if xy.shape != (4, 2) or not np.isfinite(xy).all() or (np.abs(xy[:, 1]) < 1e-6).any():
+        raise InputError(f"primaries {xy.tolist()}: four pairs x, y with y other than 0 are needed: red, green, blue, white")
+    x, y = xy.T
+    columns = np.stack([x / y, np.ones(4), (1 - x - y) / y])
+    if abs(np.linalg.det(np.stack([x[:3], y[:3], np.ones(3)]))) < 1e-4:  # twice the area of their triangle
+        raise InputError(f"primaries {xy[:3].tolist()} lie on one line; red, green and blue must span a triangle")
+    return columns[:, :3] * np.linalg.solve(columns[:, :3], columns[:, 3]), columns[:, 3]
 
 
 def luminance(rgb: ArrayLike) -> Array:

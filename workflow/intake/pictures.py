@@ -101,6 +101,15 @@ def exr_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
+def exr_chromaticities(path: Path) -> tuple[float, ...] | None:
+    """Return CIE x, y of red, green, blue and white as the header of an EXR states them, None where it does not."""
+    import OpenEXR
+
+    with reading(path, "not a readable EXR image"), OpenEXR.File(str(path), header_only=True) as file:
+        found = file.header().get("chromaticities")
+    return None if found is None else tuple(float(value) for value in found)
+
+
 def check_texture(path: Path) -> None:
     """Refuse a texture with more pixels than are allowed; what is no picture that we know is left to who reads it."""
     kind = path.suffix.lower()

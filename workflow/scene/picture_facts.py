@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from iif_core.numerics.color import REC709_PRIMARIES
 from workflow.scene.normal_form import View
 
-REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-"""CIE x, y of red, green, blue and white of linear Rec. 709, the primaries of sRGB, which every colour here is taken to have."""
 FLIP_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
@@ -33,7 +32,7 @@ def view_attributes(view: View, exposure: float) -> dict[str, Any]:
     return {
         "worldToCamera": _row_vectors(FLIP_Y @ to_camera),
         "worldToNDC": _row_vectors(to_pixel @ to_camera),
-        "chromaticities": REC709,
+        "chromaticities": tuple(value for pair in REC709_PRIMARIES for value in pair),
         "colorInteropID": "lin_rec709_scene",
         "exposure": float(exposure),
         "comments": "Linear, relative radiance; metres; world of the capture. Channels: docs/reference/artefacts.md, render.",

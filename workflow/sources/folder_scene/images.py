@@ -14,7 +14,8 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.intake.documents import reading
-from workflow.intake.pictures import exr_size, opened
+from workflow.intake.pictures import exr_chromaticities, exr_size, opened
+from workflow.sources.folder_scene.profiles import converted, linear_conversion, refuse_other
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr")
 STRIP_PIXELS = 1 << 20
@@ -49,7 +50,8 @@ class Photo:
         pixels: (H, W, 3) float32 sensor values in [0, 1], or radiance.
         valid: (H, W) bool.
         non_finite, transparent, negative, masked: counts of such pixels.
-        form: format of the file other than 8-bit colour (`grey`, `16-bit`, `16-bit grey`), else empty.
+        form: format of the file other than 8-bit colour (`grey`, `16-bit`, `16-bit grey`), or the colour space from which it was
+            converted (`in Display P3`), else empty.
     """
 
     pixels: np.ndarray
@@ -108,19 +110,30 @@ def _is_16_bit_png(path: Path) -> bool:
 
 
 def _stored(path: Path) -> np.ndarray:
-    """Read the pixels of a png or jpg, (H, W) or (H, W, C), integer; palettes are resolved."""
+    """Read the pixels of a png or jpg, (H, W) or (H, W, C), integer, as they are; palettes are resolved."""
+    return _pixels_of(path, colour=False)[0]
+
+
+def _pixels_of(path: Path, colour: bool) -> tuple[np.ndarray, str]:
+    """Read the pixels of a png or jpg, (H, W) or (H, W, C), integer; with `colour` in sRGB, and from which colour space."""
     header(path)
     with reading(path, "cannot be read", "; the file is damaged or cut short"):
         if _is_16_bit_png(path):  # Pillow truncates 16-bit colour to 8 bits
             import mitsuba as mi
 
-            return np.array(mi.Bitmap(str(path)))
+            if colour:
+                with opened(path) as image:
+                    refuse_other(image, path)
+            return np.array(mi.Bitmap(str(path))), ""
         with opened(path) as image:
+            space = ""
             if image.mode in ("P", "PA"):
                 image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
             elif image.mode == "1":
                 image = image.convert("L")
-            return np.asarray(image)
+            if colour:
+                image, space = converted(image, path)
+            return np.asarray(image), f"in {space}" if space else ""
 
 
 def _exr(path: Path) -> dict[str, np.ndarray]:
@@ -155,6 +168,7 @@ def _exr_colour(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
 def load_photo(path: Path, turn: int = 1) -> Photo:
     """Read a photograph: 8 or 16 bits become [0, 1], EXR values stay, grey becomes RGB.
 
+    Colours of another space, by the colour profile of the file or the primaries of an EXR, are converted to sRGB.
     Pixels with alpha < 0.5 and those that are NaN or infinite are not valid and become 0. EXR stores colour multiplied by alpha,
     so it is divided by alpha. Negative EXR values become 0.
     """
@@ -163,20 +177,24 @@ def load_photo(path: Path, turn: int = 1) -> Photo:
         found = _exr(path)
         names = _colours(path, found)
         height, width = found[names[0]].shape
+        to_rec709 = linear_conversion(exr_chromaticities(path), path) if names[0] != names[1] else None
+        form = "of other primaries" if to_rec709 is not None else ""
 
         def strip(rows: slice) -> tuple[np.ndarray, np.ndarray | None]:
             values = np.stack([found[name][rows].astype(np.float32) for name in names], -1)
+            if to_rec709 is not None:
+                values[..., :3] = values[..., :3] @ to_rec709.T
             if len(names) < 4:
                 return values, None
             alpha = values[..., 3]
             return values[..., :3] / np.where(np.isfinite(alpha) & (alpha >= 0.5), np.minimum(alpha, 1), 1)[..., None], alpha
     else:
-        stored = _stored(path)
+        stored, space = _pixels_of(path, colour=True)
         stored = stored[..., None] if stored.ndim == 2 else stored
         if stored.ndim != 3 or stored.dtype.kind not in "iu":
             raise InputError(f"{path}: pixels of type {stored.dtype}, shape {stored.shape}; expected 8 or 16 bits")
         height, width, channels = stored.shape
-        form = " ".join(["16-bit"] * (stored.dtype.itemsize > 1) + ["grey"] * (channels < 3))
+        form = " ".join(["16-bit"] * (stored.dtype.itemsize > 1) + ["grey"] * (channels < 3)) or space
 
         def strip(rows: slice) -> tuple[np.ndarray, np.ndarray | None]:
             values = stored[rows].astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
