@@ -130,7 +130,8 @@ def sixteen_bits(path, icc):
 
     rows = b"".join(b"\0" + np.full((4, 3), 30000, ">u2").tobytes() for _ in range(4))
     head = struct.pack(">IIBBBBB", 4, 4, 16, 2, 0, 0, 0)
-    parts = [chunk(b"IHDR", head), chunk(b"iCCP", b"p\0\0" + zlib.compress(icc)), chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b"")]
+    named = chunk(b"iCCP", b"p\0\0" + zlib.compress(icc))
+    parts = [chunk(b"IHDR", head), named, chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b"")]
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
     return path
 

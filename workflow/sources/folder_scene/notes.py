@@ -81,7 +81,8 @@ def of_pixels(frames: Sequence[Frame], counts: Mapping[str, int], forms: Sequenc
     grey, deep = "the same value in R, G and B", "values / 65535"
     meaning = {"grey": grey, "16-bit": deep, "16-bit grey": f"{deep}, the same in R, G and B"}
     for form in sorted({form for form, _ in forms}):
-        out.append(f"photographs: {len({name for own, name in forms if own == form})} {form}: {meaning.get(form, 'converted to sRGB')}")
+        count = len({name for own, name in forms if own == form})
+        out.append(f"photographs: {count} {form}: {meaning.get(form, 'converted to sRGB')}")
     turned = sum(f.turn != 1 for f in frames)
     if turned:
         out.append(f"photographs: {turned} turned upright by their EXIF orientation, as `w` x `h` say")
