@@ -54,8 +54,8 @@ def linear_from_srgb(y: ArrayLike) -> Array:
 def rec709_from_primaries(primaries: ArrayLike) -> Array:
     """Compute the matrix from linear colours of other primaries to linear Rec. 709.
 
-    XYZ = P diag(P^-1 w) rgb, where the columns of P are XYZ of the primaries at luminance 1 and w is XYZ of white. Bradford's cone
-    responses adapt white (SMPTE RP 177; Lindbloom).
+    XYZ = P diag(P^-1 w) rgb, where the columns of P are XYZ of the primaries at luminance 1 and w is XYZ of white. Bradford's
+    cone responses adapt white (SMPTE RP 177; Lindbloom).
 
     Args:
         primaries: (4, 2) CIE x, y of red, green, blue and white.

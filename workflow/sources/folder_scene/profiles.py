@@ -24,8 +24,8 @@ LARGEST_PROFILE = 4 << 20  # bytes; those of cameras and phones have less than 1
 def converted(image: Any, path: Path) -> tuple[Any, str]:
     """Convert an RGB or RGBA picture of Pillow, 8 bits a channel, to sRGB.
 
-    Colours outside of sRGB are cut off at its border. The curve of the profile is replaced by the sRGB curve, as in a program that
-    shows the picture; the response of the camera is estimated afterwards.
+    Colours outside of sRGB are cut off at its border. The curve of the profile is replaced by the sRGB curve, as in a program
+    that shows the picture; the response of the camera is estimated afterwards.
 
     Returns:
         The picture, and the name of the colour space that it had; empty if that is sRGB, or not stated.
