@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,10 +16,21 @@ import numpy as np
 
 from iif_core.camera.registration import Photo
 from iif_core.errors import InputError
+from workflow.intake.documents import reading
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureWriter, View
 from workflow.settings.source import mesh_axes
-from workflow.sources.folder_scene import alignment, exposure, images, mesh, notes, photographs, registration, transforms
+from workflow.sources.folder_scene import (
+    alignment,
+    exposure,
+    held_out,
+    images,
+    mesh,
+    notes,
+    photographs,
+    registration,
+    transforms,
+)
 from workflow.sources.folder_scene.inputs import Inputs, find_inputs
 from workflow.sources.folder_scene.photographs import Photograph, photograph, pinhole, view_of
 from workflow.sources.folder_scene.room import Room
@@ -55,6 +67,9 @@ def capture_photographs(job: Job, inputs: Inputs) -> None:
     exposures, words = exposure.given(inputs.exposures, frames, settings.exposure)
     said += words
     task = _Task(inputs, source, settings, conventions, Room.of(surface, job.threads))
+    held = _held_out(task, poses)
+    task, names = replace(task, splits=held.split), [frame.name for frame in frames]
+    said += held.notes(names)
     posed, forms = _registered(job, task, poses, exposures)
     said += [*posed.notes, *(f"view {name} left out: {reason}" for name, reason in posed.left_out.items())]
 
@@ -72,18 +87,19 @@ def capture_photographs(job: Job, inputs: Inputs) -> None:
     said += notes.of_pixels(posed.frames, taken.counts, [*forms, *taken.forms])
     said += notes.of_views(posed.frames, views, task.listed, settings.test_every, task.encoded)
     said += notes.of_objects(posed.frames, surface, inputs.mesh.name)
-    _write(job, task, posed, taken, views, surface, said)
+    _write(job, task, posed, taken, views, surface, said, held.facts(names))
 
 
 @dataclass(frozen=True)
 class _Task:
-    """What the photographs of a scene are taken with."""
+    """What the photographs of a scene are taken with; `splits`: `train` or `test` for each frame, once that is known."""
 
     inputs: Inputs
     source: Any
     settings: Any
     conventions: alignment.Conventions
     room: Room
+    splits: Sequence[str] = ()
 
     @property
     def encoded(self) -> bool:
@@ -100,8 +116,8 @@ class _Task:
         frames = self.inputs.transforms.frames
         return {frames[i].name for i in transforms.evenly_spread(len(frames), count)}
 
-    def split(self, frame: Frame, number: int) -> str:
-        """Return `train` or `test`; lists of the data set take precedence over `capture.test_every`."""
+    def asked(self, frame: Frame, number: int) -> str:
+        """Return `train` or `test`, as asked; lists of the data set take precedence over `capture.test_every`."""
         if self.listed:
             return frame.split or "train"
         every = self.settings.test_every
@@ -150,6 +166,33 @@ def _mesh(inputs: Inputs, source: Any, poses: Sequence[np.ndarray]) -> mesh.Mesh
     return found
 
 
+def _held_out(task: _Task, poses: Sequence[np.ndarray]) -> held_out.HeldOut:
+    """Hold out what is asked for, and what repeats it.
+
+    Raises:
+        InputError: that leaves no photograph to use.
+    """
+    frames = task.inputs.transforms.frames
+    split = [task.asked(frame, i) for i, frame in enumerate(frames)]
+    if "test" not in split:
+        return held_out.HeldOut(split, {}, np.zeros(0), np.zeros(0))
+    digests, focal, depths = [], np.zeros(len(frames)), np.full(len(frames), np.nan)
+    for i, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
+        with reading(frame.image, "not a readable image"), frame.image.open("rb") as file:
+            digests.append(hashlib.file_digest(file, "sha256").hexdigest())
+        focal[i] = task.view(frame, pose, i, 1.0).fx
+        if split[i] == "test":
+            depth, face = task.room.seen(task.view(frame, pose, i, 1.0, held_out.DEPTH_WIDTH))
+            depths[i] = np.median(depth[face >= 0]) if (face >= 0).any() else np.nan
+    found = held_out.hold_out(split, digests, poses, focal, depths)
+    if "train" not in found.split:
+        raise InputError(
+            f"{task.inputs.transforms.path}: every photograph that is not held out repeats a held-out one (the same file, or the"
+            " same place to a pixel), so none is left to use: remove repeated photographs, or set `capture.test_every: 0`"
+        )
+    return found
+
+
 def _registered(
     job: Job, task: _Task, poses: list[np.ndarray], gains: list[float]
 ) -> tuple[registration.Registered, list[tuple[str, str]]]:
@@ -169,7 +212,7 @@ def _registered(
         one = photograph(frame, view, task.encoded, gains[i])
         forms += [(one.form, frame.name)] * bool(one.form)
         camera = (view.fx, view.fy), (view.cx, view.cy), pose
-        held = task.split(frame, i) == "test"
+        held = task.splits[i] == "test"
         photos[-1] = Photo(one.pixels, one.valid, depth, task.room.normals_of(face), *camera, held)
         job.progress(i + 1, len(frames), "photographs registered")
     return registration.register_frames(frames, poses, photos, task.conventions.axes, task.inputs.metres), forms
@@ -183,7 +226,7 @@ def _take(job: Job, task: _Task, posed: registration.Registered, gains: list[flo
     for i, (frame, pose) in enumerate(zip(frames, posed.poses, strict=True)):
         if frame.name in posed.left_out:
             continue
-        view = replace(task.view(frame, pose, len(out.views), gains[i]), split=task.split(frame, i))
+        view = replace(task.view(frame, pose, len(out.views), gains[i]), split=task.splits[i])
         depth, face = task.room.seen(view)
         share = float((face >= 0).mean())
         if share < MIN_COVERAGE:
@@ -252,6 +295,7 @@ def _write(
     views: list[View],
     surface: mesh.Mesh,
     said: list[str],
+    held: dict[str, object],
 ) -> None:
     writer = CaptureWriter(job.writer)
     writer.cameras(views)
@@ -263,6 +307,7 @@ def _write(
         "registration": posed.facts,
         "plan": posed.plan,
         "exposure_estimated": task.settings.exposure == "estimate",
+        **({"held_out": held} if held else {}),
     }
     has_truth = any(frame.truth for frame in posed.frames)
     writer.finish(task.source.kind, task.settings.dynamic_range, has_truth, said, task.inputs.response, facts)
