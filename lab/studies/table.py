@@ -21,7 +21,7 @@ from lab.studies.regret import judge, regret_lines
 from workflow.artifacts.files import write_atomically
 from workflow.registry import upstream_of
 from workflow.runtime import fingerprint as fp
-from workflow.runtime.timings import read_parts, read_timings
+from workflow.runtime.timings import read_parts
 from workflow.settings import study_files
 
 if TYPE_CHECKING:
@@ -252,10 +252,9 @@ def _costs(cell: Cell, quality: str, stages: list[str]) -> dict[str, Any]:
     for stage in stages:
         scene = fp.home(stage, cell.name, quality)
         parts = read_parts(scene, stage)
-        whole: dict[str, Any] = parts.get("job", {})
-        jobs.append(whole or next((row for row in read_timings(scene) if row["rule"] == stage), {}))
-        alone[stage] = {name: jobs[-1].get(name) for name in ("seconds", "cpu_seconds", "max_rss_mb")}
-        jobs[-1] = {**jobs[-1], "disk_mb": _disk_mb(scene, stage)}
+        job: dict[str, Any] = parts.get("job", {})
+        alone[stage] = {name: job.get(name) for name in ("seconds", "cpu_seconds", "max_rss_mb")}
+        jobs.append({**job, "disk_mb": _disk_mb(scene, stage)})
         solver = parts.get("solve", {})
     out: dict[str, Any] = {}
     for name, together in (("seconds", sum), ("cpu_seconds", sum), ("max_rss_mb", max), ("disk_mb", sum), ("threads", max)):
