@@ -9,6 +9,7 @@ import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -621,7 +622,7 @@ def test_messages_do_not_steer_a_terminal(project, monkeypatch, capsys):
     assert line.endswith(f": {shown}\nsecond line")
     assert summary.closing(_failures({"a": steering})).endswith(f"a: failed in capture: {shown}")
     monkeypatch.setattr(verify, "damaged", lambda root, scenes: [f"{steering}: missing"])
-    assert commands._verify([]) == 1 and capsys.readouterr().out.splitlines()[0] == f"{shown}: missing"
+    assert commands._verify(SimpleNamespace(scenes=[])) == 1 and capsys.readouterr().out.splitlines()[0] == f"{shown}: missing"
 
 
 def test_the_shipped_table_can_be_read(repository):
