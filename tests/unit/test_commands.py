@@ -31,7 +31,8 @@ def test_every_word_belongs_to_a_command():
 @pytest.mark.parametrize("command", ["status", "verify"])
 def test_commands_that_only_look_start_no_libraries(monkeypatch, command):
     seen = []
-    monkeypatch.setitem(commands.COMMANDS, command, commands.COMMANDS[command]._replace(run=lambda found: seen.append(found) or 0))
+    looking = commands.COMMANDS[command]._replace(run=lambda found: seen.append(found) or 0)
+    monkeypatch.setitem(commands.COMMANDS, command, looking)
     monkeypatch.setattr("workflow.runtime.native.prepare", lambda: 1 / 0)
     monkeypatch.setattr("sys.argv", ["workflow", command, "a"])
     assert commands.main() == 0 and seen[0].scenes == ["a"]
