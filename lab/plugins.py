@@ -33,6 +33,7 @@ COSTS = {
     "relit_scores": "lab.work:relit_scores",
 }
 SCENES = "lab/config/scenes"
+DERIVED = "lab.studies.variants"
 QUALITY = "lab/config/quality"
 
 # ------------------------------- the published method and baselines, and settings that the product holds constant

@@ -11,7 +11,7 @@ from iif_core.fusion.options import FusionOptions
 from tests.errors import missing, refused
 from workflow import settings
 from workflow.registry import STAGES
-from workflow.settings import batch_table, loading, study_files, yaml_file
+from workflow.settings import batch_table, loading, yaml_file
 from workflow.settings.names import did_you_mean_path
 
 GOOD = "source: {kind: builtin}\nprior: {kind: simulated}\n"
@@ -149,7 +149,6 @@ def test_defaults_are_those_of_the_solvers(repository):
 
 def test_a_folder_without_configuration_uses_that_of_the_repository(tmp_path, repository):
     assert settings.load("kitchen", "standard", tmp_path) == settings.load("kitchen", "standard", repository)
-    assert study_files.study_names(tmp_path) == study_files.study_names(repository)
     assert batch_table.read_table(tmp_path) == batch_table.read_table(repository)
 
 

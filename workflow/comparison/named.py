@@ -15,7 +15,7 @@ from workflow.artifacts.store import MANIFEST
 from workflow.artifacts.verify import with_artefacts
 from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fp
-from workflow.settings import study_files
+from workflow.settings import derived
 from workflow.settings.names import did_you_mean
 
 QUANTITIES = ("albedo", "roughness", "metallic", "emission", "rgb")
@@ -56,8 +56,8 @@ def open_result(name: str, quality: str = "draft") -> Result:
     """
     known = [one for one in with_artefacts() if Path("results", one).is_dir()]
     folders = [name]
-    if study_files.derived(name):
-        folders += study_files.bases(name)
+    if derived.derived(name):
+        folders += derived.bases(name)
     stages = {}
     for stage in STAGES:
         home = _home(stage, name, folders, quality)

@@ -24,7 +24,7 @@ from workflow.artifacts.stamps import Stamps
 from workflow.intake.names import shown
 from workflow.registry import STAGES
 from workflow.runtime import input_digests
-from workflow.settings import study_files
+from workflow.settings import derived
 from workflow.settings.names import EXAMPLES
 from workflow.settings.relight import recombines
 
@@ -255,7 +255,7 @@ def fingerprint(stage: str, scene: str, quality: str) -> str:
         "upstream": {up: fingerprint(up, scene, quality) for up in STAGES[stage].upstream},
     }
     if STAGES[stage].shared:
-        shared = study_files.shared_scene(scene)
+        shared = derived.shared_scene(scene)
         facts["shared"] = {up: fingerprint(up, shared, quality) for up in STAGES[stage].shared}
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -263,7 +263,7 @@ def fingerprint(stage: str, scene: str, quality: str) -> str:
 @lru_cache(None)
 def home(stage: str, scene: str, quality: str) -> str:
     """Return the scene in whose folder the result of a stage lies: variants of a study share equal results."""
-    for shared in study_files.bases(scene):
+    for shared in derived.bases(scene):
         if fingerprint(stage, shared, quality) == fingerprint(stage, scene, quality):
             return shared
     return scene

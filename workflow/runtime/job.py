@@ -25,7 +25,7 @@ from workflow.artifacts.files import read_record, write_json
 from workflow.registry import SHARED, STAGES
 from workflow.runtime import device, forecast
 from workflow.runtime import fingerprint as fp
-from workflow.settings import study_files
+from workflow.settings import derived
 
 _LIBRARIES = ("numpy", "scipy", "mitsuba", "drjit", "open3d", "OpenEXR", "pyarrow", "torch", "snakemake")
 
@@ -107,7 +107,7 @@ class Job:
         """
         if stage not in self.stage.shared:
             raise AssertionError(f"stage {self.stage.name} reads {stage}, which registry.py does not list as shared")
-        return self._reader(stage, study_files.shared_scene(self.scene))
+        return self._reader(stage, derived.shared_scene(self.scene))
 
     def _reader(self, stage: str, of: str) -> StageReader:
         if (stage, of) not in self._readers:

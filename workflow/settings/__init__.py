@@ -1,10 +1,9 @@
 """The settings of a scene: one typed model that validates them and generates the JSON schema and the reference page.
 
-Order of precedence: defaults in this package < `config/quality/<quality>.yaml` < `config/scenes/<scene>.yaml`; for a variant of a
-study (study_files.py) also < `config/studies/scenes.yaml` < `config/studies/<study>.yaml`; for a line of `config/batch.tsv`
-(batch_table.py) its base takes the place of the file of the scene, under the columns of the line. `names.configuration` says when
-these files are those of the working folder and when those of the repository. Nothing else is consulted: no environment variables,
-no hidden files.
+Order of precedence: defaults in this package < `config/quality/<quality>.yaml` < `config/scenes/<scene>.yaml` < what a derived
+scene puts over it (derived.py), such as a plan of relightings; for a line of `config/batch.tsv` (batch_table.py) its base takes
+the place of the file of the scene, under the columns of the line. `names.configuration` says when these files are those of the
+working folder and when those of the repository. Nothing else is consulted: no environment variables, no hidden files.
 """
 
 from workflow.settings.document import plan_schema_json, reference_markdown, schema_json
