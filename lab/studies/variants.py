@@ -30,7 +30,7 @@ SHARED_VARIANT = "shared"
 
 
 def configuration(part: str = "", root: Path = Path(".")) -> Path:
-    """Return lab/config/studies, or a part of it: that of the working folder where it exists, otherwise that of the repository."""
+    """Return lab/config/studies, or a part of it: the working folder's where it exists, otherwise the repository's."""
     own = root / FOLDER / part
     return own if own.exists() else REPOSITORY / FOLDER / part
 

@@ -47,7 +47,6 @@ _HERE = f"{REPOSITORY}/"
 _OWN = tuple(f"{_HERE}{name}/" for name in (*PACKAGES, EXAMPLES))
 NEEDED = tuple(stage.name for stage in STAGES.values() if not stage.on_demand)
 """Stages that every scene needs, in order."""
-VGG = Path("results/weights/lpips_vgg.npz")
 
 
 def module_file(module: str) -> Path | None:
@@ -203,8 +202,7 @@ def raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
 
 
 def _raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
-    wants_vgg = stage == "base_scores" or (stage == "metrics" and document["metrics"]["lpips_vgg"])
-    out = [VGG] if wants_vgg and VGG.is_file() else []
+    out: list[Path] = []
     if stage in ("relight", "lamp_images"):
         entries = document["relight"] if stage == "relight" else [entry for entry in document["relight"] if recombines(entry)]
         out.extend(settings_module.relight_files(entries))
