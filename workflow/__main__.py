@@ -25,7 +25,8 @@ class Command(NamedTuple):
     """A command.
 
     Attributes:
-        run: does it and returns the exit code. It imports what it needs, so that no command waits for the libraries of another.
+        run: does it and returns the exit code, or raises `InputError`. It imports what it needs, so that no command waits for the
+            libraries of another.
         words: its arguments and options, keys of `WORDS`.
         computes: whether it needs native libraries, and logs.
     """
@@ -62,11 +63,7 @@ def _status(arguments: argparse.Namespace) -> int:
     from workflow.batch.status import tell
     from workflow.trade import choose
 
-    try:
-        request = choose.read({"quality": arguments.quality}, None)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    request = choose.read({"quality": arguments.quality}, None)
     return tell(arguments.scenes, lambda scene: choose.choice(request, scene).quality, arguments.json)
 
 
@@ -77,12 +74,10 @@ def _verify(arguments: argparse.Namespace) -> int:
 
     scenes, known = arguments.scenes, with_artefacts()
     if absent := next((scene for scene in scenes if scene not in known), None):
-        print(
-            f"error: {absent}: neither results/{absent} nor scenes/{absent} holds anything to verify."
-            f"{did_you_mean(absent, known)} What is here: {', '.join(known) or 'nothing'}.",
-            file=sys.stderr,
+        raise InputError(
+            f"{absent}: neither results/{absent} nor scenes/{absent} holds anything to verify."
+            f"{did_you_mean(absent, known)} What is here: {', '.join(known) or 'nothing'}."
         )
-        return 1
     problems = list(damaged(Path("."), scenes or None))
     for line in problems:
         print(written_out(line))
@@ -100,11 +95,7 @@ def _stage(arguments: argparse.Namespace) -> int:
     from workflow.settings import scene_origin
 
     stage, scene = arguments.command, arguments.scene
-    try:
-        part = read_part(arguments.part) if getattr(arguments, "part", None) else None
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    part = read_part(arguments.part) if getattr(arguments, "part", None) else None
     name = f"{stage}.{part}" if part else stage
     what, state = f"{name} of {scene}", JobState(scene, name, arguments.fingerprint)
     if guarded(what, lambda: scene_origin(scene)):
@@ -234,21 +225,25 @@ def main() -> int:
     """Run the command; the exit code is 0, or 1 with one message on stderr."""
     arguments = _arguments()
     command = COMMANDS[arguments.command]
-    if command.computes:
-        from workflow.runtime import native
-
-        try:  # before NumPy is imported: a BLAS that has started keeps its threads
-            native.prepare()
-            native.limit_threads(getattr(arguments, "threads", 1))
-        except InputError as error:
-            print(f"error: {error}", file=sys.stderr)
+    try:
+        if command.computes and _prepare(arguments):
             return 1
-        from workflow.runtime.job import configure_logging
+        return command.run(arguments)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
 
-        log = None if arguments.command in STAGES else arguments.log  # the log of a stage belongs to the process that makes it
-        if guarded("the log", lambda: configure_logging(log)):
-            return 1
-    return command.run(arguments)
+
+def _prepare(arguments: argparse.Namespace) -> int:
+    """Make native libraries and the log ready; return the exit code."""
+    from workflow.runtime import native
+
+    native.prepare()  # before NumPy is imported: a BLAS that has started keeps its threads
+    native.limit_threads(getattr(arguments, "threads", 1))
+    from workflow.runtime.job import configure_logging
+
+    log = None if arguments.command in STAGES else arguments.log  # the log of a stage belongs to the process that makes it
+    return guarded("the log", lambda: configure_logging(log))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from typing import Any
 from iif_core.errors import InputError
 from workflow import plugins
 from workflow import settings as settings_module
-from workflow.artifacts.files import read_record, sha256_of
+from workflow.artifacts.files import facts_in, sha256_of
 from workflow.artifacts.stamps import Stamps
 from workflow.intake.names import shown
 from workflow.registry import STAGES
@@ -278,8 +278,4 @@ def missing_stages(scene: str, quality: str) -> list[str]:
 
 def _made(stage: str, scene: str, quality: str) -> str:
     """Return the fingerprint under which a stage was made; empty if it was not, or its manifest cannot be read."""
-    try:
-        document = json.loads(read_record(f"results/{home(stage, scene, quality)}/{stage}/manifest.json"))
-        return str(document.get("fingerprint", ""))
-    except (OSError, ValueError, AttributeError, RecursionError):
-        return ""
+    return str(facts_in(f"results/{home(stage, scene, quality)}/{stage}/manifest.json").get("fingerprint", ""))

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
-from workflow.artifacts.files import read_record
+from workflow.artifacts.files import facts_in
 from workflow.registry import STAGES
 
 MEASURED = ("seconds", "cpu_seconds", "max_rss_mb", "threads")
@@ -36,12 +35,8 @@ def read_parts(scene: str, stage: str, root: Path = Path(".")) -> dict[str, Any]
     `expected`: what the model of costs said of it. Only numbers are kept; empty if there is no readable file. Benchmarks of
     Snakemake are not used: it looks at a job every 30 seconds, so they lack most of the CPU time of a short one.
     """
-    try:
-        document = json.loads(read_record(root / "results" / scene / "benchmarks" / f"{stage}.parts.json"))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    parts = document.items() if isinstance(document, dict) else ()
-    return {part: _numbers(facts) for part, facts in parts if isinstance(facts, dict)}
+    document = facts_in(root / "results" / scene / "benchmarks" / f"{stage}.parts.json")
+    return {part: _numbers(facts) for part, facts in document.items() if isinstance(facts, dict)}
 
 
 def _numbers(facts: dict[str, Any]) -> dict[str, float]:
