@@ -111,20 +111,14 @@ def reads(stage: str) -> tuple[str, ...]:
     return tuple(key for name, keys in _entries("READS") if name == stage for key in keys)
 
 
-def scene_folders() -> list[str]:
-    """Return the folders of the checkout, relative to it, in which plug-ins have scene files."""
-    return [module.SCENES for module in modules() if hasattr(module, "SCENES")]
-
-
-def quality_folders() -> list[str]:
-    """Return the folders of the checkout, relative to it, in which plug-ins have settings for qualities."""
-    return [module.QUALITY for module in modules() if hasattr(module, "QUALITY")]
+def named(name: str) -> list[str]:
+    """Return what plug-ins have under SCENES or QUALITY, which are folders of the checkout, or under DERIVED."""
+    return [getattr(module, name) for module in modules() if hasattr(module, name)]
 
 
 def derived() -> Any:
     """Return the module that derives further scenes from those that there are; None without such a plug-in."""
-    named = [module.DERIVED for module in modules() if hasattr(module, "DERIVED")]
-    return importlib.import_module(named[-1]) if named else None
+    return importlib.import_module(named("DERIVED")[-1]) if named("DERIVED") else None
 
 
 def added_stages() -> dict[str, dict[str, Any]]:

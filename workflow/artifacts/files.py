@@ -240,14 +240,6 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
         return {name: channel.pixels for name, channel in file.channels().items()}
 
 
-def read_attributes(path: Path) -> dict[str, Any]:
-    """Return the header of a single-part EXR."""
-    import OpenEXR
-
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        return dict(file.header())
-
-
 def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str], settled: bool = True) -> dict[str, str]:
     """Write named columns; (n, k) arrays become fixed-size lists. Equal input gives equal bytes. Returns column -> type.
 

@@ -9,6 +9,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from iif_core.errors import InputError
+from workflow import plugins
 from workflow.artifacts.files import facts_in
 from workflow.costs.machine import machine_factor
 from workflow.costs.model import Cost, Range, predict
@@ -114,7 +115,7 @@ def wall(scene: str, quality: str, cores: int) -> Wall:
         InputError: the settings or files of the scene cannot be used, or a stage is of a kind that was never measured.
     """
     settings = fingerprints.parsed(fingerprints.resolved(scene, quality))
-    rendered = settings["source"]["kind"] in ("builtin", "mitsuba")
+    rendered = plugins.function("SIZES", settings["source"]["kind"]) is not None
     total = [START, START, START]
     for stage in STAGES.values():
         if stage.on_demand or (stage.name == "capture" and rendered):

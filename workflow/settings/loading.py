@@ -166,7 +166,7 @@ def _quality(quality: str, root: Path) -> dict[str, Any]:
         hint = did_you_mean(quality, names)
         raise InputError(f"--config quality={quality}: unknown quality.{hint} Allowed: {', '.join(names)}")
     settings = read_yaml(configuration(f"quality/{quality}.yaml", root))
-    added = (REPOSITORY / folder / f"{quality}.yaml" for folder in plugins.quality_folders())
+    added = (REPOSITORY / folder / f"{quality}.yaml" for folder in plugins.named("QUALITY"))
     for path in (path for path in added if path.is_file()):
         settings = merge(read_yaml(path), settings)
     if "quality" not in settings:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from iif_core.errors import InputError
-from workflow.artifacts.files import write_json
+from workflow.artifacts.files import facts_in, write_json
 from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import forecast
@@ -118,13 +118,12 @@ def keep(request: Request, chosen: Mapping[str, Choice]) -> None:
 
 
 def _kept(request: Request, scene: str) -> Choice | None:
+    document = facts_in(_file(scene))
+    made = Choice(str(document.get("quality", "")), str(document.get("line", "")))
     try:
-        document = json.loads(_file(scene).read_text())
-        made = Choice(str(document["quality"]), str(document["line"]))
-        same = _marks(request, scene, made.quality).items() <= document.items()
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, InputError):
+        return made if _marks(request, scene, made.quality).items() <= document.items() else None
+    except InputError:  # there is no such quality any more
         return None
-    return made if same else None
 
 
 def _file(scene: str) -> Path:
