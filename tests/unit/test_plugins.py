@@ -116,8 +116,9 @@ def test_a_name_of_no_module_is_refused(python):
 
 
 def test_the_schema_is_that_of_the_product_alone(python, repository):
-    code = "from workflow import settings; print(settings.schema_json() + settings.reference_markdown(), end='')"
-    kept = [(repository / path).read_text() for path in ("config/scene.schema.json", "docs/reference/settings.md")]
-    assert good(python(code)) == "".join(kept)
-    refused = python("import runpy; runpy.run_module('workflow.settings', run_name='__main__')", "tests.extra_names")
+    page = repository / "docs/site/settings_page.py"
+    code = f"import json, runpy; print(json.dumps(runpy.run_path({str(page)!r})['written']()))"
+    found = json.loads(good(python(code)))
+    assert len(found) == 3 and found == {name: (repository / name).read_text() for name in found}
+    refused = python(f"import runpy; runpy.run_path({str(page)!r}, run_name='__main__')", "tests.extra_names")
     assert refused.returncode and "IIF_PLUGINS" in refused.stderr

@@ -1,6 +1,7 @@
 """Settings: defaults, precedence, and errors that name file, key, what was found and what is allowed."""
 
 import itertools
+import runpy
 from dataclasses import fields
 from pathlib import Path
 
@@ -196,8 +197,8 @@ def test_the_kitchen_can_be_relit_as_it_is_shipped(repository):
     assert plan == "kitchen" and {"dimmed", "evening", "vase", "lamp"} <= set(names)
 
 
-def test_the_page_has_ranges_and_each_line_once():
-    text = settings.reference_markdown()
+def test_the_page_has_ranges_and_each_line_once(repository):
+    text = runpy.run_path(str(repository / "docs/site/settings_page.py"))["reference_markdown"]()
     assert "(1 to 64)" in text and "(> 0)" in text and "Ge(" not in text
     lines = [line for line in text.splitlines() if line.startswith("| `")]
     assert len(lines) == len(set(lines)) and "Also of `learned`: `seed`." in text
