@@ -10,6 +10,21 @@ KINDS = {
     "prior": {"simulated": ("lab.simulated.prior", "lab.settings.prior:SimulatedPrior")},
 }
 ADDED = {
+    "base_scores": {
+        "does": "Score the base texture; made on demand by studies.",
+        "place": "lab.studies.base_scores",
+        "upstream": ("capture", "prior", "segmentation", "base"),
+        "settings": (),
+        "reads_raw": True,
+        "files": ("lab.studies.weights",),
+    },
+    "common_scores": {
+        "does": "Score the result at views that all variants of a study share; made on demand by studies.",
+        "place": "lab.studies.common_scores",
+        "upstream": ("capture", "segmentation", "base", "emission", "second_look", "affines"),
+        "settings": ("seed",),
+        "shared": ("capture", "segmentation"),
+    },
     "relit_truth": {
         "does": "Render the source of a scene with truth under new light; made on demand by studies.",
         "place": "lab.relit.truth",
@@ -27,12 +42,15 @@ ADDED = {
 }
 SIZES = {"builtin": "lab.work:faces_of_room", "mitsuba": "lab.work:faces_of_files"}
 COSTS = {
+    "base_scores": "lab.work:base_scores",
+    "common_scores": "lab.work:common_scores",
     "builtin": "lab.work:rendered",
     "mitsuba": "lab.work:rendered",
     "relit_truth": "lab.work:relit_truth",
     "relit_scores": "lab.work:relit_scores",
 }
 SCENES = "lab/config/scenes"
+DERIVED = "lab.studies.variants"
 QUALITY = "lab/config/quality"
 
 # ------------------------------- the published method and baselines, and settings that the product holds constant

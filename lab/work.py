@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from workflow.costs.work import SceneSize
+from workflow.costs.work import MILLION, SceneSize, base_cells
 
-MILLION = 1e6
 FACES_OF_ROOM = 60_000
 """Of a room that is made, before its faces are divided."""
 
@@ -37,6 +35,16 @@ def relit_truth(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[st
 def relit_scores(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     """Count the work of stage `relit_scores`."""
     return "all", _relit_pictures(settings, size)
+
+
+def base_scores(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    """Count the work of stage `base_scores`."""
+    return "all", {"pixels": size.pixels / MILLION}
+
+
+def common_scores(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    """Count the work of stage `common_scores`."""
+    return "all", {"faces": size.faces / MILLION, "cells": base_cells(settings, size)}
 
 
 def _relit_pictures(settings: dict[str, Any], size: SceneSize) -> dict[str, float]:

@@ -14,82 +14,70 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from iif_core.errors import InputError
 from workflow.registry import STAGES
 from workflow.runtime.ending import guarded
 
+
+class Command(NamedTuple):
+    """A command.
+
+    Attributes:
+        run: does it and returns the exit code, or raises `InputError`. It imports what it needs, so that no command waits for the
+            libraries of another.
+        words: its arguments and options, keys of `WORDS`.
+        computes: whether it needs native libraries, and logs.
+    """
+
+    run: Callable[[argparse.Namespace], int]
+    words: str
+    computes: bool = True
+
+
+WORDS: dict[str, dict[str, Any]] = {
+    "scene": {},
+    "scenes": {"nargs": "*"},
+    "a": {"help": "a scene or a variant with a finished result"},
+    "b": {},
+    "maps": {"type": Path, "help": "folder with albedo/<view>.exr or .png, roughness/, metallic/, emission/, rgb/"},
+    "--quality": {"default": "draft"},
+    "--threads": {"type": int, "default": 2},
+    "--fingerprint": {"help": "of the plan: a stage refuses to run when it differs; without it, a summary is a partial one"},
+    "--part": {"help": "only the views of this part, such as 3-of-8; the stage stays unfinished"},
+    "--plan": {"default": "", "help": "of config/relight/; without it, the relightings of the scene itself"},
+    "--colour": {"default": "auto", "help": "how albedo is decoded: srgb, linear, or auto (PNG as sRGB)"},
+    "--output": {"type": Path, "help": "folder; by default compare/<a>,<b> or score/<scene>"},
+    "--over": {"action": "store_true", "help": "the run is over: what has not ended by now was killed"},
+    "--refused": {"action": "store_true", "help": "only say which scenes cannot be run, and fail"},
+    "--json": {"action": "store_true", "help": "one JSON object for each scene, each on a line"},
+    "--log": {"type": Path},
+}
+"""Arguments and options, each with the keywords of `argparse`."""
 SCATTERED = ("prior",)
 """Stages whose views can be dealt out to several jobs."""
 
 
-def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m workflow", description=__doc__)
-    commands = parser.add_subparsers(dest="command", required=True)
-    for stage in STAGES:
-        sub = commands.add_parser(stage)
-        sub.add_argument("scene")
-        sub.add_argument("--quality", default="draft")
-        sub.add_argument("--threads", type=int, default=2)
-        sub.add_argument("--fingerprint", help="refuse to run when it differs")
-        sub.add_argument("--log", type=Path)
-        if stage in SCATTERED:
-            sub.add_argument("--part", help="only the views of this part, such as 3-of-8; the stage stays unfinished")
-    planned = commands.add_parser("planned")
-    planned.add_argument("scene")
-    planned.add_argument("--quality", default="draft")
-    planned.add_argument("--log", type=Path)
-    relit = commands.add_parser("relit")
-    relit.add_argument("scene")
-    relit.add_argument("--plan", default="", help="of config/relight/; without it, the relightings of the scene itself")
-    relit.add_argument("--quality", default="draft")
-    relit.add_argument("--log", type=Path)
-    bench = commands.add_parser("bench")
-    bench.add_argument("scene")
-    bench.add_argument("--log", type=Path)
-    compare = commands.add_parser("compare")
-    compare.add_argument("a", help="a scene or a variant with a finished result")
-    compare.add_argument("b")
-    compare.add_argument("--quality", default="draft")
-    compare.add_argument("--output", type=Path, help="folder; by default compare/<a>,<b>")
-    compare.add_argument("--log", type=Path)
-    score = commands.add_parser("score")
-    score.add_argument("scene")
-    score.add_argument("maps", type=Path, help="folder with albedo/<view>.exr or .png, roughness/, metallic/, emission/, rgb/")
-    score.add_argument("--colour", default="auto", help="how albedo is decoded: srgb, linear, or auto (PNG as sRGB)")
-    score.add_argument("--quality", default="draft")
-    score.add_argument("--output", type=Path, help="folder; by default score/<scene>")
-    score.add_argument("--log", type=Path)
-    lpips = commands.add_parser("lpips_vgg")
-    lpips.add_argument("--log", type=Path)
-    batch = commands.add_parser("batch")
-    batch.add_argument("--quality", default="draft")
-    batch.add_argument("--fingerprint", help="of the plan whose jobs are all done; without it the summary is a partial one")
-    batch.add_argument("--over", action="store_true", help="the run is over: what has not ended by now was killed")
-    batch.add_argument("--refused", action="store_true", help="only say which scenes cannot be run, and fail")
-    batch.add_argument("--log", type=Path)
-    status = commands.add_parser("status")
-    status.add_argument("scenes", nargs="*")
-    status.add_argument("--quality", default="draft")
-    status.add_argument("--json", action="store_true", help="one JSON object for each scene, each on a line")
-    verify = commands.add_parser("verify")
-    verify.add_argument("scenes", nargs="*")
-    return parser.parse_args()
+def _status(arguments: argparse.Namespace) -> int:
+    from workflow.batch.status import tell
+    from workflow.trade import choose
+
+    request = choose.read({"quality": arguments.quality}, None)
+    return tell(arguments.scenes, lambda scene: choose.choice(request, scene).quality, arguments.json)
 
 
-def _verify(scenes: list[str]) -> int:
+def _verify(arguments: argparse.Namespace) -> int:
     from workflow.artifacts.verify import damaged, with_artefacts
     from workflow.runtime.job_state import written_out
     from workflow.settings.names import did_you_mean
 
-    known = with_artefacts()
+    scenes, known = arguments.scenes, with_artefacts()
     if absent := next((scene for scene in scenes if scene not in known), None):
-        print(
-            f"error: {absent}: neither results/{absent} nor scenes/{absent} holds anything to verify."
-            f"{did_you_mean(absent, known)} What is here: {', '.join(known) or 'nothing'}.",
-            file=sys.stderr,
+        raise InputError(
+            f"{absent}: neither results/{absent} nor scenes/{absent} holds anything to verify."
+            f"{did_you_mean(absent, known)} What is here: {', '.join(known) or 'nothing'}."
         )
-        return 1
     problems = list(damaged(Path("."), scenes or None))
     for line in problems:
         print(written_out(line))
@@ -99,40 +87,21 @@ def _verify(scenes: list[str]) -> int:
     return 1 if problems else 0
 
 
-def _status(scenes: list[str], quality: str, as_json: bool) -> int:
-    from workflow.batch.status import tell
-    from workflow.trade import choose
-
-    try:
-        request = choose.read({"quality": quality}, None)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return tell(scenes, lambda scene: choose.choice(request, scene).quality, as_json)
-
-
-def _run_stage(arguments: argparse.Namespace) -> int:
+def _stage(arguments: argparse.Namespace) -> int:
     from workflow.artifacts import locks
-    from workflow.artifacts.files import write_atomically
     from workflow.runtime.job import configure_logging, read_part, run_stage
     from workflow.runtime.job_state import JobState
     from workflow.scene.named import check_overrides
     from workflow.settings import scene_origin
 
     stage, scene = arguments.command, arguments.scene
-    try:
-        part = read_part(arguments.part) if getattr(arguments, "part", None) else None
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    part = read_part(arguments.part) if getattr(arguments, "part", None) else None
     name = f"{stage}.{part}" if part else stage
     what, state = f"{name} of {scene}", JobState(scene, name, arguments.fingerprint)
     if guarded(what, lambda: scene_origin(scene)):
         return 1  # no folder is made for a scene that does not exist
 
     def run() -> None:
-        note = Path("results") / scene / "benchmarks" / f"{name}.threads"
-        write_atomically(note, lambda path: path.write_text(f"{arguments.threads}\n"))
         check_overrides(stage, scene, arguments.quality)
         run_stage(stage, scene, arguments.quality, arguments.threads, arguments.fingerprint, part)
 
@@ -157,7 +126,11 @@ def _batch(arguments: argparse.Namespace) -> int:
     return guarded("batch", lambda: summary.write_summary(arguments.quality, arguments.fingerprint, arguments.over))
 
 
-def _planned(scene: str, quality: str) -> None:
+def _planned(arguments: argparse.Namespace) -> int:
+    return guarded("planned", partial(_write_plan, arguments.scene, arguments.quality))
+
+
+def _write_plan(scene: str, quality: str) -> None:
     """Write plan/<scene>/plan.yaml: the decisions of stage `plan`, and what is expected of them."""
     from workflow.artifacts import StageReader, links
     from workflow.artifacts.files import write_atomically
@@ -174,72 +147,103 @@ def _planned(scene: str, quality: str) -> None:
     print(text)
 
 
-def _into(arguments: argparse.Namespace, place: Path, work: Callable[[], None]) -> Callable[[], None]:
-    """Return `work` with a check before it: where the user names no place, a stranger's results may have put a link there."""
+def _relit(arguments: argparse.Namespace) -> int:
+    from workflow.relighting.copies import deliver
+
+    return guarded("relit", partial(deliver, arguments.scene, arguments.plan, arguments.quality))
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    from workflow.trade.bench import write_bench
+
+    return guarded("bench", partial(write_bench, arguments.scene))
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    from workflow.comparison.pair import write_comparison
+
+    pair = (arguments.a, arguments.b)
+    place = arguments.output or Path("compare") / ",".join(pair)
+    return _page("compare", arguments, place, partial(write_comparison, *pair, arguments.quality, place))
+
+
+def _score(arguments: argparse.Namespace) -> int:
+    from workflow.comparison.maps import write_scores
+
+    place = arguments.output or Path("score") / arguments.scene
+    work = partial(write_scores, arguments.scene, arguments.maps, arguments.quality, arguments.colour, place)
+    return _page(f"score {arguments.scene}", arguments, place, work)
+
+
+def _page(what: str, arguments: argparse.Namespace, place: Path, work: Callable[[], None]) -> int:
+    """Do `work`, which writes to a folder. Where the user names no place, a stranger's results may have put a link there."""
+    from workflow.artifacts import links
+    from workflow.runtime.job_state import JobState
 
     def checked() -> None:
-        from workflow.artifacts import links
-
         if not arguments.output:
             links.check_folder(str(place))
         work()
 
-    return checked
+    return guarded(what, checked, JobState("studies", arguments.command))
+
+
+def _lpips_vgg(arguments: argparse.Namespace) -> int:
+    from workflow.models.lpips import fetch_vgg
+    from workflow.runtime.job_state import JobState
+
+    return guarded("fetching VGG16", fetch_vgg, JobState("weights", "lpips_vgg"))
+
+
+_OF_STAGE = "scene --quality --threads --fingerprint --log"
+COMMANDS = {
+    **{stage: Command(_stage, _OF_STAGE + " --part" * (stage in SCATTERED)) for stage in STAGES},
+    "planned": Command(_planned, "scene --quality --log"),
+    "relit": Command(_relit, "scene --plan --quality --log"),
+    "bench": Command(_bench, "scene --log"),
+    "compare": Command(_compare, "a b --quality --output --log"),
+    "score": Command(_score, "scene maps --colour --quality --output --log"),
+    "lpips_vgg": Command(_lpips_vgg, "--log"),
+    "batch": Command(_batch, "--quality --fingerprint --over --refused --log"),
+    "status": Command(_status, "scenes --quality --json", computes=False),
+    "verify": Command(_verify, "scenes", computes=False),
+}
+"""Command -> what it does and takes."""
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m workflow", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    for name, command in COMMANDS.items():
+        sub = commands.add_parser(name)
+        for word in command.words.split():
+            sub.add_argument(word, **WORDS[word])
+    return parser.parse_args()
 
 
 def main() -> int:
     """Run the command; the exit code is 0, or 1 with one message on stderr."""
     arguments = _arguments()
-    if arguments.command == "status":
-        return _status(arguments.scenes, arguments.quality, arguments.json)
-    if arguments.command == "verify":
-        return _verify(arguments.scenes)
-    from workflow.runtime import native
-
-    try:  # before NumPy is imported: a BLAS that has started keeps its threads
-        native.prepare()
-        native.limit_threads(getattr(arguments, "threads", 1))
+    command = COMMANDS[arguments.command]
+    try:
+        if command.computes and _prepare(arguments):
+            return 1
+        return command.run(arguments)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+
+
+def _prepare(arguments: argparse.Namespace) -> int:
+    """Make native libraries and the log ready; return the exit code."""
+    from workflow.runtime import native
+
+    native.prepare()  # before NumPy is imported: a BLAS that has started keeps its threads
+    native.limit_threads(getattr(arguments, "threads", 1))
     from workflow.runtime.job import configure_logging
-    from workflow.runtime.job_state import JobState
 
     log = None if arguments.command in STAGES else arguments.log  # the log of a stage belongs to the process that makes it
-    if guarded("the log", lambda: configure_logging(log)):
-        return 1
-    if arguments.command in STAGES:
-        return _run_stage(arguments)
-    if arguments.command == "planned":
-        return guarded("planned", partial(_planned, arguments.scene, arguments.quality))
-    if arguments.command == "relit":
-        from workflow.relighting.copies import deliver
-
-        return guarded("relit", partial(deliver, arguments.scene, arguments.plan, arguments.quality))
-    if arguments.command == "bench":
-        from workflow.trade.bench import write_bench
-
-        return guarded("bench", partial(write_bench, arguments.scene))
-    if arguments.command == "compare":
-        from workflow.comparison.pair import write_comparison
-
-        pair = (arguments.a, arguments.b)
-        place = arguments.output or Path("compare") / ",".join(pair)
-        work = partial(write_comparison, *pair, arguments.quality, place)
-        return guarded("compare", _into(arguments, place, work), JobState("studies", "compare"))
-    if arguments.command == "score":
-        from workflow.comparison.maps import write_scores
-
-        place = arguments.output or Path("score") / arguments.scene
-        work = partial(write_scores, arguments.scene, arguments.maps, arguments.quality, arguments.colour, place)
-        return guarded(f"score {arguments.scene}", _into(arguments, place, work), JobState("studies", "score"))
-    if arguments.command == "lpips_vgg":
-        from workflow.models.lpips import fetch_vgg
-
-        return guarded("fetching VGG16", fetch_vgg, JobState("weights", "lpips_vgg"))
-    if arguments.command == "batch":
-        return _batch(arguments)
-    raise AssertionError(f"command {arguments.command} is not written")
+    return guarded("the log", lambda: configure_logging(log))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,8 @@ holds nothing but names, so that it imports nothing, and defines any of
     SIZES    kind of source that is rendered -> function of its settings and of the faces of its mesh files -> faces
     COSTS    such a kind, or an added stage -> function of settings and size -> kind and counts (workflow/costs/work.py)
     SCENES   folder of the checkout with further scene files
+    DERIVED  module that derives further scenes (workflow/settings/derived.py), with `layers`, `bases`, `shared_scene` and
+             `file_of_source`
     QUALITY  folder of the checkout with settings that lie under those of the quality of the same name
 
 Classes and functions are written `package.module:name`. The settings of the product read the classes while they are imported
@@ -109,14 +111,14 @@ def reads(stage: str) -> tuple[str, ...]:
     return tuple(key for name, keys in _entries("READS") if name == stage for key in keys)
 
 
-def scene_folders() -> list[str]:
-    """Return the folders of the checkout, relative to it, in which plug-ins have scene files."""
-    return [module.SCENES for module in modules() if hasattr(module, "SCENES")]
+def named(name: str) -> list[str]:
+    """Return what plug-ins have under SCENES or QUALITY, which are folders of the checkout, or under DERIVED."""
+    return [getattr(module, name) for module in modules() if hasattr(module, name)]
 
 
-def quality_folders() -> list[str]:
-    """Return the folders of the checkout, relative to it, in which plug-ins have settings for qualities."""
-    return [module.QUALITY for module in modules() if hasattr(module, "QUALITY")]
+def derived() -> Any:
+    """Return the module that derives further scenes from those that there are; None without such a plug-in."""
+    return importlib.import_module(named("DERIVED")[-1]) if named("DERIVED") else None
 
 
 def added_stages() -> dict[str, dict[str, Any]]:

@@ -21,8 +21,8 @@ class Stage:
         upstream: stages whose files it reads.
         settings: dotted paths of the settings that it reads.
         reads_raw: whether files from outside results/ enter here.
-        on_demand: whether no scene needs it, only a study or its own target.
-        shared: stages whose files it reads in the folder of the scene that all variants of a study share.
+        on_demand: whether no scene needs it, only its own target or a plug-in.
+        shared: stages whose files it reads in the folder of the scene that all derived scenes of a plug-in share.
         files: modules whose `raw_inputs` know (and check) further input files.
         place: name of its module where that is not `workflow.stages.<name>`.
         threads: cores that its job takes, unless a profile says otherwise.
@@ -105,14 +105,6 @@ STAGES: dict[str, Stage] = {
             ("base", "seed"),
         ),
         Stage(
-            "base_scores",
-            "Score the base texture; made on demand by studies.",
-            ("capture", "prior", "segmentation", "base"),
-            (),
-            reads_raw=True,
-            on_demand=True,
-        ),
-        Stage(
             "emission",
             "Find the emitters and solve for their radiance.",
             ("capture", "plan", "segmentation", "base"),
@@ -173,14 +165,7 @@ STAGES: dict[str, Stage] = {
             ("capture", "prior", "segmentation", "base", "emission", "shading", "second_look", "affines", "render"),
             ("metrics",),
             reads_raw=True,
-        ),
-        Stage(
-            "common_scores",
-            "Score the result at views that all variants of a study share; made on demand by studies.",
-            ("capture", "segmentation", "base", "emission", "second_look", "affines"),
-            ("seed",),
-            on_demand=True,
-            shared=("capture", "segmentation"),
+            files=("workflow.models.lpips",),
         ),
         Stage(
             "unwrap",

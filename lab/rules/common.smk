@@ -4,7 +4,7 @@ import sys
 from lab.stability.record import code as stability_code_digest
 from lab.studies import grid as study_sheet
 from lab.studies import table as study_table
-from workflow.settings import study_files
+from workflow.settings import derived as derived_scenes
 
 KERNEL_BENCHMARKS = "hashgrid|base_cost"
 STABILITY_PARTS = (
@@ -22,7 +22,7 @@ STABILITY_PARTS = (
 
 
 wildcard_constraints:
-    study=rf"(?!(?:{KERNEL_BENCHMARKS}|stability)\.){study_files.STUDY}",
+    study=rf"(?!(?:{KERNEL_BENCHMARKS}|stability)\.){derived_scenes.STUDY}",
     benchmark=KERNEL_BENCHMARKS,
     part="|".join(STABILITY_PARTS),
 

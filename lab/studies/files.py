@@ -1,4 +1,4 @@
-"""The files of studies, config/studies/*.yaml: everything in them, checked (lab/docs/studies.md)."""
+"""The files of studies, lab/config/studies/*.yaml: everything in them, checked (lab/docs/studies.md)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from pydantic import ConfigDict, Field, PositiveFloat, ValidationError
 
 from iif_core.errors import InputError
 from iif_core.evaluation import catalogue
+from lab.studies import variants as of_settings
+from lab.studies.variants import SCENES
 from workflow.registry import STAGES
-from workflow.settings import study_files
 from workflow.settings.explain import needed
 from workflow.settings.names import did_you_mean
 from workflow.settings.section import Section
-from workflow.settings.study_files import SCENES
 from workflow.settings.yaml_file import read_yaml
 
 MORRIS_LEVELS = 4
@@ -26,7 +26,7 @@ METRICS = tuple(name for name in catalogue.METRICS if name != "psnr_3d")
 QUANTITIES = (*catalogue.PROTOCOLS_OF, "rgb_held_out", *catalogue.RELIT)
 
 
-class Variant(study_files.Variant):
+class Variant(of_settings.Variant):
     """One row of the table."""
 
     model_config = ConfigDict(extra="forbid")
@@ -44,7 +44,7 @@ class Paper(Section):
     """`quantity/metric` -> number."""
 
 
-class Design(study_files.Design):
+class Design(of_settings.Design):
     """Runs of a design."""
 
     model_config = ConfigDict(extra="forbid")
@@ -89,15 +89,15 @@ class Sheet(Section):
     """Scene -> [x, y, size] of a square that is shown enlarged, as shares of the width and the height."""
 
 
-class Study(study_files.Study):
-    """One file under config/studies/."""
+class Study(of_settings.Study):
+    """One file under lab/config/studies/."""
 
     model_config = ConfigDict(extra="forbid")
 
     title: str
     """Title of the table and the picture."""
     scenes: list[str] = Field(min_length=1)
-    """Names of entries in config/studies/scenes.yaml."""
+    """Names of entries in lab/config/studies/scenes.yaml."""
     repeats: dict[str, Annotated[list[int], Field(min_length=1)]] = {}
     """Variant -> further seeds, where one of `seeds` does not tell how much a score varies."""
     scores: Literal["base_scores", "metrics", "common_scores", "relit_scores"] = "base_scores"
@@ -139,7 +139,7 @@ def load_study(name: str, root: Path = Path(".")) -> Study:
     Raises:
         InputError: names the file, the key, what was found and what is allowed.
     """
-    path, file = study_files.study_path(name, root)
+    path, file = of_settings.study_path(name, root)
     return _load_study(path, file, root, file.stat().st_mtime_ns)
 
 
@@ -149,7 +149,7 @@ def _load_study(path: Path, file: Path, root: Path, _stamp: int) -> Study:
         study = Study.model_validate(read_yaml(file))
     except ValidationError as error:
         raise InputError(_explain(error, path)) from None
-    study = study_files.expanded(study, path, Variant)
+    study = of_settings.expanded(study, path, Variant)
     variants = study.variants
     if study.design and study.design.trajectories:
         _check_trajectories(study.design, path)
@@ -171,7 +171,7 @@ def _load_study(path: Path, file: Path, root: Path, _stamp: int) -> Study:
     for dotted in [*wanted, *study.plot.group]:
         if dotted not in varied:
             raise InputError(f"{path}: `plot`: no variant sets {dotted or 'x'!r}. Allowed here: {', '.join(varied) or 'none'}.")
-    shared = study_files.scene_overrides(root)
+    shared = of_settings.scene_overrides(root)
     if study.reference and study.reference not in variants:
         raise InputError(f"{path}: `reference: {study.reference}`: no such variant. Allowed here: {', '.join(variants)}.")
     if study.opposites and not study.reference:
@@ -237,7 +237,7 @@ def _explain(error: ValidationError, path: Path) -> str:
             hint = did_you_mean(where[-1], allowed, "`{}`")
             lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
         elif problem["type"] == "missing":
-            lines.append(f"{path}: `{dotted}`: missing. Add it; config/studies/aggregation.yaml is a complete example.")
+            lines.append(f"{path}: `{dotted}`: missing. Add it; lab/config/studies/aggregation.yaml is a complete example.")
         else:
             shown = found if not isinstance(found, dict) else "a mapping"
             lines.append(f"{path}: `{dotted}`: found {shown!r}. {needed(problem)}.")

@@ -252,7 +252,7 @@ def write_claims(study: Study, table: Path, path: Path) -> None:
     if not table.is_file():
         raise InputError(f"{table}: not found; `python -m lab study regret --keep {table}` makes it from a run of the study")
     if not study.opposites:
-        raise InputError("config/studies/regret.yaml: no `opposites`, so nothing says what its variants force")
+        raise InputError("lab/config/studies/regret.yaml: no `opposites`, so nothing says what its variants force")
     scores = [(*key.split("/"), protocol) for key in study.show for protocol in study.protocols]
     kept, left_out = judge(pd.read_csv(table, dtype={"variant": str}), study.opposites, study.reference, scores)
     text = json.dumps(claims(kept, left_out), indent=1) + "\n"

@@ -54,7 +54,7 @@ def runs(study: str, seed: int) -> list[str]:
     """
     design = load_study(study).design
     if design is None or not design.trajectories:
-        raise InputError(f"config/studies/{study}.yaml: no `design` with `trajectories`, as tradeoff_screening.yaml has")
+        raise InputError(f"lab/config/studies/{study}.yaml: no `design` with `trajectories`, as tradeoff_screening.yaml has")
     return trajectories(list(design.factors), design.trajectories, seed)
 
 

@@ -18,11 +18,12 @@ from lab.costs.records import disk_mb
 from lab.studies.files import Paper, Study, load_study
 from lab.studies.growth import growth_lines
 from lab.studies.regret import judge, regret_lines
+from lab.studies.variants import FOLDER
 from workflow.artifacts.files import write_atomically
 from workflow.registry import upstream_of
 from workflow.runtime import fingerprint as fp
-from workflow.runtime.timings import read_parts, read_timings
-from workflow.settings import study_files
+from workflow.runtime.timings import read_parts
+from workflow.settings.derived import scene_of, shared_scene
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -60,13 +61,13 @@ def plan(name: str, quality: str) -> Plan:
     cells, skipped = [], {}
     for scene in study.scenes:
         of_scene = [
-            Cell(scene, variant, seed, study_files.scene_of(name, scene, variant, seed))
+            Cell(scene, variant, seed, scene_of(name, scene, variant, seed))
             for variant in study.variants
             for seed in study.seeds_of(variant)
         ]
         for cell in of_scene:
             fp.resolved(cell.name, quality)
-            fp.resolved(study_files.shared_scene(cell.name), quality)
+            fp.resolved(shared_scene(cell.name), quality)
         try:
             fp.fingerprint("prior", f"{scene}--s{study.seeds[0]}", quality)
         except InputError as error:
@@ -237,7 +238,7 @@ def _scores(cell: Cell, quality: str, stage: str, row: str) -> dict[tuple[str, s
     if "variant" in frame:
         if row not in set(frame["variant"]):
             known = ", ".join(sorted(set(frame["variant"])))
-            raise InputError(f"{study_files.FOLDER}: `row: {row}` of {cell.name}: not in variants.parquet, which has {known}")
+            raise InputError(f"{FOLDER}: `row: {row}` of {cell.name}: not in variants.parquet, which has {known}")
         frame = frame[frame["variant"] == row]
     means = frame.groupby(["quantity", "metric", "protocol"])["value"].agg(["mean", "count"])
     return {key: (float(row["mean"]), int(row["count"])) for key, row in means.iterrows()}
@@ -252,10 +253,9 @@ def _costs(cell: Cell, quality: str, stages: list[str]) -> dict[str, Any]:
     for stage in stages:
         scene = fp.home(stage, cell.name, quality)
         parts = read_parts(scene, stage)
-        whole: dict[str, Any] = parts.get("job", {})
-        jobs.append(whole or next((row for row in read_timings(scene) if row["rule"] == stage), {}))
-        alone[stage] = {name: jobs[-1].get(name) for name in ("seconds", "cpu_seconds", "max_rss_mb")}
-        jobs[-1] = {**jobs[-1], "disk_mb": _disk_mb(scene, stage)}
+        job: dict[str, Any] = parts.get("job", {})
+        alone[stage] = {name: job.get(name) for name in ("seconds", "cpu_seconds", "max_rss_mb")}
+        jobs.append({**job, "disk_mb": _disk_mb(scene, stage)})
         solver = parts.get("solve", {})
     out: dict[str, Any] = {}
     for name, together in (("seconds", sum), ("cpu_seconds", sum), ("max_rss_mb", max), ("disk_mb", sum), ("threads", max)):

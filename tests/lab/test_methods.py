@@ -99,13 +99,13 @@ def test_nobody_has_measured_what_takes_the_place_of_a_stage():
 def study(tmp_path):
     """`study(variant)`: the folder of a scene `t` and of a study `a` with one variant, `theirs`, as YAML."""
     (tmp_path / "config/scenes").mkdir(parents=True)
-    (tmp_path / "config/studies").mkdir()
+    (tmp_path / "lab/config/studies").mkdir(parents=True)
     scene = "source: {kind: builtin, scene: tiny}\nprior: {kind: simulated}\nbase: {solver: sgd, texture: cells, iterations: 5}\n"
     (tmp_path / "config/scenes/t.yaml").write_text(scene)
-    (tmp_path / "config/studies/scenes.yaml").write_text("t: {}\n")
+    (tmp_path / "lab/config/studies/scenes.yaml").write_text("t: {}\n")
 
     def write(variant):
-        (tmp_path / "config/studies/a.yaml").write_text(f"title: x\nscenes: [t]\nvariants:\n  theirs: {variant}\n")
+        (tmp_path / "lab/config/studies/a.yaml").write_text(f"title: x\nscenes: [t]\nvariants:\n  theirs: {variant}\n")
         return tmp_path
 
     return write
@@ -121,5 +121,5 @@ def test_a_preset_lies_between_the_scene_and_the_variant(study):
 
 
 def test_a_preset_that_is_not_there_is_refused_with_those_that_are(study):
-    with pytest.raises(InputError, match=r"config/studies/presets/publshed.yaml.*published, published_repaired"):
+    with pytest.raises(InputError, match=r"lab/config/studies/presets/publshed.yaml.*published, published_repaired"):
         settings.load("t--a-theirs-s0", "draft", study("{preset: publshed}"))

@@ -37,11 +37,13 @@ def test_effects_of_a_plane_are_its_slopes_and_interaction_shows_as_spread():
 
 def study(tmp_path, monkeypatch, runs, count=2):
     """A study of two factors with these runs, loaded."""
-    (tmp_path / "config/studies").mkdir(parents=True)
-    (tmp_path / "config/studies/scenes.yaml").write_text("a: {source: {kind: builtin, scene: tiny}, prior: {kind: simulated}}\n")
+    (tmp_path / "lab/config/studies").mkdir(parents=True)
+    (tmp_path / "lab/config/studies/scenes.yaml").write_text(
+        "a: {source: {kind: builtin, scene: tiny}, prior: {kind: simulated}}\n"
+    )
     levels = "{base.ridge: [1, 2, 3, 4], prior.samples: [1, 2, 3, 4]}"
     design = f"{{trajectories: {count}, factors: {levels}, runs: {json.dumps(runs)}}}"
-    (tmp_path / "config/studies/s.yaml").write_text(f"title: T\nscenes: [a]\ndesign: {design}\n")
+    (tmp_path / "lab/config/studies/s.yaml").write_text(f"title: T\nscenes: [a]\ndesign: {design}\n")
     monkeypatch.chdir(tmp_path)
     return load_study("s")
 
@@ -54,7 +56,7 @@ def test_runs_become_variants_and_a_run_that_is_there_twice_is_one(tmp_path, mon
 
 @pytest.mark.parametrize("runs", [["00", "10", "12"], ["00", "22", "20"], ["00", "20", "00"], ["00", "00", "02"]])
 def test_runs_that_are_no_trajectories_are_refused(tmp_path, monkeypatch, runs):
-    with refused("config/studies/s.yaml", "design.runs", f"'{runs[0]}'"):
+    with refused("lab/config/studies/s.yaml", "design.runs", f"'{runs[0]}'"):
         study(tmp_path, monkeypatch, [*runs, "00", "20", "22"])
 
 

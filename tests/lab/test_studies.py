@@ -10,16 +10,16 @@ import pytest
 from scipy import stats
 
 from iif_core.fusion.uncertainty import CALIBRATION
-from lab.studies import files
+from lab.studies import files, variants
 from lab.studies import table as study_table
 from tests.errors import refused
-from workflow import settings
+from workflow import plugins, settings
 from workflow.artifacts import DamagedArtefact, StageWriter
 from workflow.runtime import fingerprint as fp
 from workflow.runtime.job import Job
 from workflow.runtime.timings import read_parts
 from workflow.scoring import scores
-from workflow.settings import study_files
+from workflow.settings import derived
 
 SCENE = "source: {kind: builtin, scene: tiny}\nprior: {kind: simulated, strength: 0.5}\ncapture: {views: 9, width: 32}\n"
 SHARED = "t: {capture: {width: 64}, prior: {samples: 4}}\n"
@@ -34,32 +34,46 @@ variants:
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """`folder(name, text)` writes config/<name>.yaml in an empty folder, which is the current one."""
+    """`folder(name, text)` writes config/<name>.yaml in an empty folder, which is the current one; studies in lab/config/."""
     monkeypatch.chdir(tmp_path)
 
     def write(name, text):
-        path = tmp_path / "config" / f"{name}.yaml"
+        path = tmp_path / ("lab/config" if name.startswith("studies/") else "config") / f"{name}.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-        for cached in (fp.resolved, fp.fingerprint, fp.home, study_table.plan, study_files._load_study, files._load_study):
+        for cached in (fp.resolved, fp.fingerprint, fp.home, study_table.plan, variants._load_study, files._load_study):
             cached.cache_clear()
 
     write("scenes/t", SCENE)
     write("studies/scenes", SHARED)
     write("studies/a", STUDY)
     yield write
-    for cached in (fp.resolved, fp.fingerprint, fp.home, study_table.plan, study_files._load_study, files._load_study):
+    for cached in (fp.resolved, fp.fingerprint, fp.home, study_table.plan, variants._load_study, files._load_study):
         cached.cache_clear()
 
 
 def test_names_come_apart_as_they_were_put_together(folder):
-    assert study_files.derived("t--a-mean-2-s17") == ("t", "a", "mean-2", 17)
-    assert study_files.derived(study_files.scene_of("a", "my-room", "sgd-s3", 0)) == ("my-room", "a", "sgd-s3", 0)
-    assert study_files.derived("t--s3") == ("t", "", "", 3)
+    assert derived.derived("t--a-mean-2-s17") == ("t", "a", "mean-2", 17)
+    assert derived.derived(derived.scene_of("a", "my-room", "sgd-s3", 0)) == ("my-room", "a", "sgd-s3", 0)
+    assert derived.derived("t--s3") == ("t", "", "", 3)
     for plain in ("t", "t--", "t--a", "t--s03", "t--a-full", "t--A-full-s0"):
-        assert study_files.derived(plain) is None
+        assert derived.derived(plain) is None
     folder("scenes/t--s3", SCENE)  # a scene of that name goes first
-    assert study_files.derived("t--s3") is None and study_files.bases("t--s3") == []
+    assert derived.derived("t--s3") is None and derived.bases("t--s3") == []
+
+
+def test_without_the_laboratory_only_the_product_derives_scenes(folder, monkeypatch):
+    monkeypatch.setattr(plugins, "derived", lambda: None)
+    assert derived.derived("t--a-full-s0") is None and derived.derived("t--s0") is None
+    assert derived.derived("t--bench-p03-s0") == ("t", "bench", "p03", 0)
+    assert derived.bases("t--relight-evening-s0") == ["t"] and derived.bases("t--bench-p03-s0") == []
+    assert derived.bases("t--s3") == [] and derived.shared_scene("t--s3") == "t--s3"
+    with refused("config/scenes/t--a-full-s0.yaml", "not found"):
+        settings.load("t--a-full-s0")
+
+
+def test_a_folder_without_studies_uses_those_of_the_repository(tmp_path, repository):
+    assert variants.study_names(tmp_path) == variants.study_names(repository) != []
 
 
 def test_layers_lie_over_one_another(folder):
@@ -80,10 +94,10 @@ def test_an_entry_with_a_source_needs_no_scene_file(folder):
     with refused("config/scenes/r.yaml", "t"):
         settings.load("r")
     folder("studies/scenes", SHARED + own.replace("scene: sky", "scene: sku"))
-    with refused("config/studies/scenes.yaml", "r", "source.scene", "'sku'"):
+    with refused("lab/config/studies/scenes.yaml", "r", "source.scene", "'sku'"):
         settings.load("r--s0")
     folder("studies/scenes", SHARED + "r: {prior: {kind: simulated}}\n")
-    with refused("config/studies/scenes.yaml", "r", "source", "t"):
+    with refused("lab/config/studies/scenes.yaml", "r", "source", "t"):
         settings.load("t--s0")
 
 
@@ -200,7 +214,7 @@ def test_a_variant_chooses_a_preset_over_what_the_study_shares(folder):
 )
 def test_mistakes_in_a_study_of_the_result(folder, text, words):
     folder("studies/late", text)
-    with refused("config/studies/late.yaml", *words):
+    with refused("lab/config/studies/late.yaml", *words):
         study_table.plan("late", "draft")
 
 
@@ -374,15 +388,15 @@ def test_grids_are_variants(folder):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (STUDY + "colour: 1\n", ["config/studies/a.yaml", "colour", "title", "scenes"]),
+        (STUDY + "colour: 1\n", ["lab/config/studies/a.yaml", "colour", "title", "scenes"]),
         (STUDY.replace("label:", "lable:"), ["variants.mean-2.lable", "label", "overrides", "preset", "row"]),
         (STUDY + "plot: {kind: pie}\n", ["plot.kind", "'pie'", "'bars'"]),
         (STUDY + "plot: {kidn: bars}\n", ["plot.kidn", "kind, x, group, history, log"]),
         (STUDY + "plot: {kind: line, x: base.sweeps}\n", ["plot", "'base.sweeps'", "base.variant"]),
         (STUDY.replace("mean-2", "me an"), ["variants", "'me an'"]),
-        (STUDY.replace("scenes: [t]", "scenes: [tt]"), ["scenes", "tt", "config/studies/scenes.yaml", "t"]),
+        (STUDY.replace("scenes: [t]", "scenes: [tt]"), ["scenes", "tt", "lab/config/studies/scenes.yaml", "t"]),
         (STUDY.replace("scenes: [t]", "scenes: []"), ["scenes", "[]", 1]),
-        (STUDY.replace("scenes: [t]\n", ""), ["scenes", "config/studies/aggregation.yaml"]),
+        (STUDY.replace("scenes: [t]\n", ""), ["scenes", "lab/config/studies/aggregation.yaml"]),
         (STUDY + "show: [albedo/pnsr]\n", ["show", "'albedo/pnsr'", "psnr"]),
         (STUDY + "paper: {best: {protocol: raw, values: {}}}\n", ["paper.best", "full, mean-2"]),
         (
@@ -397,16 +411,16 @@ def test_grids_are_variants(folder):
 )
 def test_mistakes_in_a_study(folder, text, words):
     folder("studies/a", text)
-    with refused("config/studies/a.yaml", *words):
+    with refused("lab/config/studies/a.yaml", *words):
         files.load_study("a")
 
 
 def test_settings_are_blamed_on_the_file_that_spoils_them(folder):
     folder("studies/a", STUDY.replace("object_mean", "mode"))
-    with refused("config/studies/a.yaml, variant mean-2", "base.variant", "'mode'", "'full'"):
+    with refused("lab/config/studies/a.yaml, variant mean-2", "base.variant", "'mode'", "'full'"):
         study_table.plan("a", "draft")
     folder("studies/scenes", "t: {capture: {widht: 64}}\n")
-    with refused("config/studies/scenes.yaml, t", "capture.widht", "width"):
+    with refused("lab/config/studies/scenes.yaml, t", "capture.widht", "width"):
         study_table.plan("a", "draft")
     folder("scenes/t", SCENE + "sed: 3\n")
     with refused("config/scenes/t.yaml", "sed", "seed"):
@@ -416,8 +430,8 @@ def test_settings_are_blamed_on_the_file_that_spoils_them(folder):
 @pytest.mark.parametrize(
     ("scene", "words"),
     [
-        ("t--a-mean-s0", ["config/studies/a.yaml", "mean", "full, mean-2"]),
-        ("t--b-full-s0", ["config/studies/b.yaml", "a"]),
+        ("t--a-mean-s0", ["lab/config/studies/a.yaml", "mean", "full, mean-2"]),
+        ("t--b-full-s0", ["lab/config/studies/b.yaml", "a"]),
         ("u--a-full-s0", ["config/scenes/u.yaml", "t"]),
     ],
 )
@@ -428,19 +442,19 @@ def test_unknown_derived_scenes(folder, scene, words):
 
 def test_unlisted_scenes(folder):
     folder("scenes/u", SCENE)
-    with refused("config/studies/scenes.yaml: u", "t"):
+    with refused("lab/config/studies/scenes.yaml: u", "t"):
         settings.load("u--a-full-s0")
     folder("studies/scenes", SHARED + "kitchn: {}\n")
-    with refused("config/studies/scenes.yaml", "kitchn", "source"):
+    with refused("lab/config/studies/scenes.yaml", "kitchn", "source"):
         files.load_study("a")
 
 
 def test_shipped_studies_load_at_every_quality(repository, monkeypatch):
     monkeypatch.chdir(repository)
-    for name in study_files.study_names():
+    for name in variants.study_names():
         study = files.load_study(name)
         for quality, scene, variant in itertools.product(settings.QUALITIES, study.scenes, study.variants):
-            settings.load(study_files.scene_of(name, scene, variant, study.seeds[0]), quality)
+            settings.load(derived.scene_of(name, scene, variant, study.seeds[0]), quality)
 
 
 def test_parts_of_a_job_are_timed(folder):

@@ -44,8 +44,8 @@ class Study:
         self.repository, self.folder = repository, folder
         self.write("config/scenes/tiny.yaml", TINY)
         self.write("config/scenes/elsewhere.yaml", "source: {kind: mitsuba, path: no/such.xml}\nprior: {kind: simulated}\n")
-        self.write("config/studies/scenes.yaml", SCENES)
-        self.write("config/studies/two.yaml", STUDY)
+        self.write("lab/config/studies/scenes.yaml", SCENES)
+        self.write("lab/config/studies/two.yaml", STUDY)
 
     def write(self, name, text):
         path = self.folder / name
@@ -112,10 +112,10 @@ def test_a_sheet_shows_the_finished_variants_beside_the_truth(study):
         left = 0.065 * len("roughness") + 0.12
         assert abs(sheet.width / sheet.height - (left + 3 * 1.38) / (0.3 + 3 * 1.38)) < 0.02
     assert "Nothing to be done" in study.run("results/studies/two.grid.png").stderr
-    study.write("config/studies/never.yaml", STUDY.replace("variant: object_mean", "ridge: 0.7"))
+    study.write("lab/config/studies/never.yaml", STUDY.replace("variant: object_mean", "ridge: 0.7"))
     never = study.run("results/studies/never.grid.pdf", "-n")
     assert missing(never.stderr, "results/studies/never.grid")  # `plain` is shared with the other study
-    study.write("config/studies/never.yaml", STUDY.replace("seeds: [0, 1]", "seeds: [7]"))
+    study.write("lab/config/studies/never.yaml", STUDY.replace("seeds: [0, 1]", "seeds: [7]"))
     never = study.run("results/studies/never.grid.pdf", "-n")
     assert never.returncode != 0 and not missing(never.stderr, "results/studies/never.grid")
 
@@ -138,12 +138,12 @@ def test_second_run_does_nothing_and_all_is_verified(study):
 
 
 def test_a_second_study_shares_and_a_label_reruns_the_table_alone(study):
-    study.write("config/studies/other.yaml", STUDY.replace("title: Two ways", "title: Another").replace("mean:", "average:"))
+    study.write("lab/config/studies/other.yaml", STUDY.replace("title: Two ways", "title: Another").replace("mean:", "average:"))
     assert planned(study.run("-n", "results/studies/other.parquet")) == {"base", "base_scores", "study"}
-    before = (study.folder / "config/studies/two.yaml").read_text()
-    study.write("config/studies/two.yaml", before.replace("mean of an object", "object mean"))
+    before = (study.folder / "lab/config/studies/two.yaml").read_text()
+    study.write("lab/config/studies/two.yaml", before.replace("mean of an object", "object mean"))
     rules = planned(study.run("-n", "results/studies/two.parquet"))
-    study.write("config/studies/two.yaml", before)
+    study.write("lab/config/studies/two.yaml", before)
     assert rules == {"study"}
 
 
@@ -164,14 +164,14 @@ plot: {kind: pareto}
 
 
 def test_variants_of_other_photographs_are_planned_with_what_they_share(study):
-    study.write("config/studies/sizes.yaml", SHARED)
+    study.write("lab/config/studies/sizes.yaml", SHARED)
     rules = planned(study.run("-n", "results/studies/sizes.parquet"))
     assert rules >= {"capture", "affines", "metrics", "common_scores", "study"}
 
 
 @pytest.mark.long
 def test_variants_of_other_photographs_are_scored_at_the_views_that_they_share(study):
-    study.write("config/studies/sizes.yaml", SHARED)
+    study.write("lab/config/studies/sizes.yaml", SHARED)
     result = study.run("results/studies/sizes.parquet")
     assert result.returncode == 0, result.stderr[-4000:]
     frame = pd.read_parquet(study.folder / "results/studies/sizes.parquet")
@@ -196,8 +196,8 @@ def test_variants_of_other_photographs_are_scored_at_the_views_that_they_share(s
 @pytest.mark.parametrize(
     ("target", "text", "words"),
     [
-        ("nothing", None, ["config/studies/nothing.yaml", "two"]),
-        ("bad", STUDY + "sedes: [3]\n", ["config/studies/bad.yaml", "sedes", "seeds"]),
+        ("nothing", None, ["lab/config/studies/nothing.yaml", "two"]),
+        ("bad", STUDY + "sedes: [3]\n", ["lab/config/studies/bad.yaml", "sedes", "seeds"]),
         ("bad", STUDY.replace("variant:", "varint:"), ["bad.yaml, variant mean", "base.varint", "variant"]),
         ("bad", STUDY.replace("plain:", "pl.ain:"), ["bad.yaml", "variants", "'pl.ain'"]),
         ("bad", SHARED.replace('"11"', '"12"'), ["design.runs", "'12'"]),
@@ -208,7 +208,7 @@ def test_variants_of_other_photographs_are_scored_at_the_views_that_they_share(s
 )
 def test_mistakes_stop_before_any_job(study, target, text, words):
     if text:
-        study.write("config/studies/bad.yaml", text)
+        study.write("lab/config/studies/bad.yaml", text)
     result = study.run(f"results/studies/{target}.parquet")
     assert result.returncode != 0 and "Traceback" not in result.stderr and "Select jobs" not in result.stderr
     named(result.stderr, *words)

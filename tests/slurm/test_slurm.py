@@ -147,9 +147,9 @@ def test_a_scene_that_failed_goes_on_where_it_stopped(batch):
 def beside_stages(folder, scene, seconds):
     """Seconds of a run in which no stage was at work, and the seconds in which at least one was."""
     spans = []
-    for benchmark in folder.glob(f"results/{scene}/benchmarks/*.jsonl"):
-        end = benchmark.with_name(f"{benchmark.stem}.parts.json").stat().st_mtime  # Snakemake touches the benchmark itself
-        spans.append((end - json.loads(benchmark.read_text().splitlines()[-1])["s"], end))
+    for record in folder.glob(f"results/{scene}/benchmarks/*.parts.json"):
+        end = record.stat().st_mtime
+        spans.append((end - json.loads(record.read_text())["job"]["seconds"], end))
     busy = until = 0.0
     for start, end in sorted(spans):
         busy += max(0.0, end - max(start, until))
@@ -197,8 +197,9 @@ def test_one_job_for_each_stage(batch, local):
     options += ["--slurm-partition-config", folder / "partitions.yaml"]
     done, _ = run(folder, "slurm", "results/a/prior/manifest.json", *options)
     assert done.returncode == 0, done.stderr[-3000:]
-    noted = {path.stem: path.read_text().strip() for path in folder.glob("results/a/benchmarks/*.threads")}
-    assert noted["capture"] == "2" and noted["prior"] == noted["prior.2-of-2"] == "1"
+    places = folder.glob("results/a/benchmarks/*.parts.json")
+    threads = {path.name.partition(".")[0]: json.loads(path.read_text())["job"]["threads"] for path in places}
+    assert threads["capture"] == 2 and threads["prior"] == 1
     for stage in ("capture", "prior"):
         own, other = (root / f"results/a/{stage}/manifest.json" for root in (folder, local))
         assert own.read_bytes() == other.read_bytes()

@@ -243,7 +243,7 @@ LINKS = (
     *(f"results/s/{name}" for name in ("base", "logs", "locks", "stamps", "benchmarks", "parts")),
     "results/s/logs/base.log",
     "results/s/locks/base",
-    "results/s/benchmarks/base.jsonl",
+    "results/s/benchmarks/base.parts.json",
     "results/s/stamps/base.json",
     "scenes/s",
     "scenes/.s.tmp",

@@ -9,6 +9,7 @@ import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -333,9 +334,8 @@ def five(project, monkeypatch):
         path.touch()
     benchmarks = Path("results/done/benchmarks")
     benchmarks.mkdir(parents=True)
-    (benchmarks / "capture.jsonl").write_text('{"s": 3.0, "cpu_time": 4.0, "max_rss": 100.0}\n')
-    (benchmarks / "base.jsonl").write_text('{"s": 5.0, "cpu_time": 6.0, "max_rss": 80.0}\n')
-    write_json(benchmarks / "base.parts.json", {"job": {"cpu_seconds": 7.0, "max_rss_mb": 120.0}})
+    write_json(benchmarks / "capture.parts.json", {"job": {"seconds": 3.0, "cpu_seconds": 4.0, "max_rss_mb": 100.0}})
+    write_json(benchmarks / "base.parts.json", {"job": {"seconds": 5.0, "cpu_seconds": 7.0, "max_rss_mb": 120.0}})
 
     write_json(Path("scenes/idle/manifest.json"), {"fingerprint": "publish of other settings"})
     write_json(Path("results/idle/capture/manifest.json"), {"fingerprint": "capture of idle"})
@@ -441,11 +441,10 @@ def test_a_damaged_deliverable_is_a_row_and_not_the_end(five):
 
 
 @pytest.mark.parametrize(
-    "content", ["[1]", '{"s": "1e999", "cpu_time": [], "job": 3}', '{"s": 1, "job": {"cpu_seconds": "x"}}', "[" * 9999]
+    "content", ["[1]", '{"job": 3}', '{"job": {"seconds": 1e999, "cpu_seconds": [], "threads": "x"}}', "[" * 9999]
 )
 def test_records_of_jobs_may_hold_anything(five, content):
-    for name in ("base.jsonl", "base.parts.json", "base.threads"):
-        (Path("results/done/benchmarks") / name).write_text(content)
+    Path("results/done/benchmarks/base.parts.json").write_text(content)
     summary.write_summary("draft")
     assert "\tdone\tdone\t" in Path("results/batch/summary.tsv").read_text()
 
@@ -623,7 +622,7 @@ def test_messages_do_not_steer_a_terminal(project, monkeypatch, capsys):
     assert line.endswith(f": {shown}\nsecond line")
     assert summary.closing(_failures({"a": steering})).endswith(f"a: failed in capture: {shown}")
     monkeypatch.setattr(verify, "damaged", lambda root, scenes: [f"{steering}: missing"])
-    assert commands._verify([]) == 1 and capsys.readouterr().out.splitlines()[0] == f"{shown}: missing"
+    assert commands._verify(SimpleNamespace(scenes=[])) == 1 and capsys.readouterr().out.splitlines()[0] == f"{shown}: missing"
 
 
 def test_the_shipped_table_can_be_read(repository):

@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
@@ -17,7 +18,7 @@ from iif_core.numerics import color
 from iif_core.numerics.xp import NUMPY
 from tests.errors import named
 from tests.oracles.blender import require_bpy
-from workflow.artifacts.files import read_attributes, read_exr, sha256_of, write_exr
+from workflow.artifacts.files import read_exr, sha256_of, write_exr
 from workflow.exporters import camera_files
 from workflow.exporters.object_table import csv_bytes, hex_colour, object_rows, read_csv
 from workflow.scene.normal_form import View
@@ -36,6 +37,12 @@ def projected(view, points):
     """Pixels of points by the pinhole camera, OpenCV axes; the reference of every other form."""
     local = (points - view.world_from_camera[:3, 3]) @ view.world_from_camera[:3, :3]
     return np.stack([view.fx * local[:, 0] / local[:, 2] + view.cx, view.fy * local[:, 1] / local[:, 2] + view.cy], 1)
+
+
+def read_attributes(path):
+    """Header of an EXR."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return dict(file.header())
 
 
 def document():

@@ -32,6 +32,35 @@ def test_a_plug_in_that_takes_no_part_changes_no_fingerprint(python):
     assert good(python(KITCHEN)) == good(python(KITCHEN, "tests.extra_names"))
 
 
+def test_settings_that_became_constants_are_refused_with_what_became_of_them(python, tmp_path):
+    """Without plug-ins, of which that of the laboratory has some of them still."""
+    gone = {
+        "kind: fipt, validation: none": ["source.validation", "held out"],
+        "kind: fipt, ids: parts": ["source.ids", "IndexMA"],
+        "kind: scannetpp, lists: train": ["source.lists", "held out"],
+        "kind: scannetpp, drop_bad: false": ["source.drop_bad", "left out"],
+        "kind: folder}\nreport: {views: 3": ["report.views", "6 of them"],
+        "kind: folder}\nsegmentation: {colour: 0": ["segmentation.colour", "`scale`"],
+        "kind: folder}\nsegmentation: {kind: masks, sam2: {confidence: 0.5}": ["segmentation.sam2.confidence", "same for all"],
+    }
+    (tmp_path / "config/scenes").mkdir(parents=True)
+    for number, text in enumerate(gone):
+        (tmp_path / f"config/scenes/s{number}.yaml").write_text(f"source: {{path: p, {text}}}\n")
+    code = f"""
+from iif_core.errors import InputError
+from workflow import settings
+for number in range({len(gone)}):
+    try:
+        settings.load(f"s{{number}}")
+    except InputError as error:
+        print(error)
+"""
+    said = good(python(code, folder=tmp_path)).splitlines()
+    assert len(said) == len(gone)
+    for line, (key, remedy) in zip(said, gone.values(), strict=True):
+        assert f"`{key}`: unknown key." in line and remedy in line and "delete it" in line or "move the other" in line, line
+
+
 @pytest.mark.parametrize("first", ["workflow.settings", "workflow.registry", "tests.extra.settings"])
 def test_a_plug_in_adds_kinds_fields_and_stages(python, first):
     code = f"""
@@ -87,8 +116,9 @@ def test_a_name_of_no_module_is_refused(python):
 
 
 def test_the_schema_is_that_of_the_product_alone(python, repository):
-    code = "from workflow import settings; print(settings.schema_json() + settings.reference_markdown(), end='')"
-    kept = [(repository / path).read_text() for path in ("config/scene.schema.json", "docs/reference/settings.md")]
-    assert good(python(code)) == "".join(kept)
-    refused = python("import runpy; runpy.run_module('workflow.settings', run_name='__main__')", "tests.extra_names")
+    page = repository / "docs/site/settings_page.py"
+    code = f"import json, runpy; print(json.dumps(runpy.run_path({str(page)!r})['written']()))"
+    found = json.loads(good(python(code)))
+    assert len(found) == 3 and found == {name: (repository / name).read_text() for name in found}
+    refused = python(f"import runpy; runpy.run_path({str(page)!r}, run_name='__main__')", "tests.extra_names")
     assert refused.returncode and "IIF_PLUGINS" in refused.stderr

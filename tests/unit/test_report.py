@@ -254,11 +254,13 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     job.writer.finish()
     benchmarks = root / "results/toy/benchmarks"
     benchmarks.mkdir(parents=True)
-    old = {"s": 99.0, "cpu_time": 1, "max_rss": 1}
-    new = {"s": 12.5, "cpu_time": 20.25, "max_rss": 300.5, "threads": 2}
-    (benchmarks / "base.jsonl").write_text(f"{json.dumps(old)}\n{json.dumps(new)}\n")
-    (benchmarks / "base.parts.json").write_text(json.dumps({"expected": {"cpu_seconds": 10.0, "memory_mb": 77.0}}))
-    (benchmarks / "affines.jsonl").write_text(json.dumps({"s": 0.2, "cpu_time": "NA", "max_rss": "NA"}) + "\n")
+    measured = {"seconds": 12.5, "cpu_seconds": 20.25, "max_rss_mb": 300.5, "threads": 2}
+    (benchmarks / "base.parts.json").write_text(
+        json.dumps({"job": measured, "solve": {"seconds": 1.0}, "expected": {"cpu_seconds": 10.0, "memory_mb": 77.0}})
+    )
+    (benchmarks / "base.jsonl").write_text('{"s": 99.0, "cpu_time": 1, "max_rss": 1, "threads": 7}\n')  # of Snakemake
+    (benchmarks / "affines.parts.json").write_text('{"job": {"seconds": 0.2, "cpu_seconds": "NA", "max_rss_mb": 1e999}}')
+    (benchmarks / "publish.parts.json").write_text('{"job": {"seconds": 9.0}}')
 
 
 def finish(root, upto="publish"):
@@ -503,8 +505,8 @@ def test_editing_the_deliverable_does_not_reach_the_results(toy, tmp_path):
 def test_timings(toy):
     rows = read_timings("toy", toy)
     assert [row["rule"] for row in rows] == ["base", "affines"]
-    assert rows[0]["seconds"] == 12.5 and rows[0]["cpu_seconds"] == 20.25 and rows[0]["threads"] == 2
-    assert rows[1]["cpu_seconds"] == 0.0 and rows[1]["threads"] == 0
+    assert [rows[0][key] for key in ("seconds", "cpu_seconds", "max_rss_mb", "threads")] == [12.5, 20.25, 300.5, 2]
+    assert [rows[1][key] for key in ("seconds", "cpu_seconds", "max_rss_mb", "threads")] == [0.2, 0.0, 0.0, 0]
     assert rows[0]["expected"] == {"cpu_seconds": 10.0, "memory_mb": 77.0} and rows[1]["expected"] == {}
     page = (toy / "scenes/toy/report.html").read_text()
     assert '<td class="off" title="off by more than a factor of 2">10.0</td>' in page

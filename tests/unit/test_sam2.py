@@ -205,7 +205,7 @@ def test_a_killed_stage_goes_on_where_it_was(made, tmp_path, monkeypatch):
 
 def test_no_mask_in_any_view_is_refused(made, tmp_path):
     scene(tmp_path, made, confidence=1.0)
-    with refused("SAM 2", 4, "segmentation.sam2.confidence"):
+    with refused("SAM 2", 4, "checkpoint", "segmentation"):
         own.run(tmp_path, "segmentation")
 
 

@@ -93,7 +93,7 @@ class Stage:
                 importlib.import_module(STAGES[self.name].module).time = SimpleNamespace(monotonic=lambda: 0.0)
             disk = Disk(Path("."), fault)
             with unflushed(), disk.watched():
-                code = commands._run_stage(arguments)
+                code = commands._stage(arguments)
             told.write_text(json.dumps(disk.steps))
         finally:
             sys.stdout.flush()

@@ -16,7 +16,6 @@ emission: {rows: 2000, samples: 8}
 shading: {samples: 8, levels: 6}
 affines: {pixels: 8000, iterations: 5}
 render: {samples: 8}
-report: {views: 2}
 room: {lightmap_size: 128, samples: 256}
 """
 

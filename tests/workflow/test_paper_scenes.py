@@ -10,7 +10,7 @@ from workflow.settings.batch_table import read_table
 
 SMALL = (
     "capture.width=48;capture.height=48;prior.samples=3;emission.rows=2000;emission.samples=8;shading.samples=8;"
-    "shading.levels=6;affines.pixels=8000;render.samples=8;report.views=2"
+    "shading.levels=6;affines.pixels=8000;render.samples=8"
 )
 
 

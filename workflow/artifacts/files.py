@@ -50,6 +50,34 @@ def read_record(path: Path | str) -> bytes:
         return file.read(LARGEST_RECORD + 1)
 
 
+def facts_in(path: Path | str) -> dict[str, Any]:
+    """Return the object that a JSON file of facts holds; an empty one if the file is not there, cannot be read or holds anything
+    else. Never raises: it is for facts that a caller can do without, or that its own reader reports."""
+    try:
+        document = json.loads(read_record(path))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return document if isinstance(document, dict) else {}
+
+
+def fault_of(path: Path, facts: dict[str, Any], digest: Callable[[Path], str]) -> str:
+    """Return what is wrong with a file that a manifest lists; empty if it is as it was written.
+
+    Args:
+        path: of the file.
+        facts: what the manifest says of it.
+        digest: returns the SHA-256 of a file, in hexadecimal.
+    """
+    try:
+        if not path.is_file():
+            return "missing"
+        if (size := path.stat().st_size) != facts["bytes"]:
+            return f"{size} bytes on disk, {facts['bytes']} were written"
+        return "" if digest(path) == facts["sha256"] else "its content changed since it was written (sha256 differs)"
+    except FileNotFoundError:  # a job that makes it again has removed it meanwhile
+        return "missing"
+
+
 def inside(folder: Path, name: str) -> Path:
     """Return `folder / name`, which must be a file below `folder`, also after symbolic links are followed.
 
@@ -210,14 +238,6 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
 
     with OpenEXR.File(str(path), separate_channels=True) as file:
         return {name: channel.pixels for name, channel in file.channels().items()}
-
-
-def read_attributes(path: Path) -> dict[str, Any]:
-    """Return the header of a single-part EXR."""
-    import OpenEXR
-
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        return dict(file.header())
 
 
 def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str], settled: bool = True) -> dict[str, str]:

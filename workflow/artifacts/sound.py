@@ -114,17 +114,12 @@ def wrong_files(folder: Path, document: dict[str, Any], noted: Stamps | None = N
         if noted and noted.known(path) == facts["sha256"]:
             continue
         try:
-            io.inside(folder, name)
-            if not Path(path).is_file():
-                yield f"{path}: missing"
-            elif (size := Path(path).stat().st_size) != facts["bytes"]:
-                yield f"{path}: {size} bytes on disk, {facts['bytes']} were written"
-            elif (noted.of(path) if noted else io.sha256_of(Path(path))) != facts["sha256"]:
-                yield f"{path}: its content changed since it was written (sha256 differs)"
+            fault = io.fault_of(io.inside(folder, name), facts, noted.of if noted else io.sha256_of)
         except InputError as error:
             yield str(error)
-        except FileNotFoundError:  # a job that makes it again has removed it meanwhile
-            yield f"{path}: missing"
+            continue
+        if fault:
+            yield f"{path}: {fault}"
 
 
 def made_from_another(folder: Path, document: dict[str, Any]) -> Iterator[str]:

@@ -235,13 +235,8 @@ class StageReader:
         if facts is None:
             known = ", ".join(list(self.manifest["files"])[:8])
             raise self._damaged(path, f"not in the manifest (it lists {known}, ...)")
-        if not path.is_file():
-            raise self._damaged(path, "missing")
-        size = path.stat().st_size
-        if size != facts["bytes"]:
-            raise self._damaged(path, f"{size} bytes on disk, {facts['bytes']} were written")
-        if IN_THIS_PROCESS.of(path) != facts["sha256"]:
-            raise self._damaged(path, "its content changed since it was written (sha256 differs)")
+        if fault := io.fault_of(path, facts, IN_THIS_PROCESS.of):
+            raise self._damaged(path, fault)
         return path
 
     def exr(self, name: str) -> dict[str, np.ndarray]:
@@ -290,10 +285,7 @@ def _raise_if_of_disk(error: Exception) -> None:
 
 def quality_in(path: Path) -> str | None:
     """Return the quality that a broken manifest names, if that can still be read, for the command that makes the stage again."""
-    try:
-        quality = json.loads(io.read_record(path))["quality"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
+    quality = io.facts_in(path).get("quality")
     return quality if isinstance(quality, str) and quality.isidentifier() else None
 
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from iif_core.errors import InputError
 from workflow.artifacts import links, stamps
-from workflow.artifacts.files import read_record
+from workflow.artifacts.files import facts_in
 from workflow.artifacts.manifest import MANIFEST
 from workflow.batch.plan import check
 from workflow.registry import STAGES
@@ -110,7 +108,7 @@ def _at_rest(found: Standing, jobs: dict[str, Noted]) -> Standing:
     links.refuse(Path("results"), scene)
     faults = [fault for fault in check(scene, quality) if fault]
     path = f"scenes/{scene}/{MANIFEST}"
-    published, touched = _document(path), os.stat(path).st_mtime if os.path.isfile(path) else None
+    published, touched = facts_in(path), os.stat(path).st_mtime if os.path.isfile(path) else None
     current = published.get("fingerprint") == fp.fingerprint("publish", scene, quality)
     missing = [] if current else fp.missing_stages(scene, quality)
     ended = _ended(jobs, missing or list(fp.NEEDED), scene, quality)
@@ -203,11 +201,3 @@ def last_line(path: str) -> str:
 def printable(text: str) -> str:
     """Return a text in one line without characters that could steer a terminal."""
     return "".join(character if character.isprintable() else " " for character in text)
-
-
-def _document(path: str) -> dict[str, Any]:
-    try:
-        document = json.loads(read_record(path))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return document if isinstance(document, dict) else {}

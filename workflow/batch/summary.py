@@ -23,7 +23,7 @@ from workflow.batch.page import render, write_pictures
 from workflow.batch.standing import STATES, standing
 from workflow.runtime import fingerprint as fp
 from workflow.runtime.job_state import SILENCE, written_out
-from workflow.runtime.timings import read_parts, read_timings
+from workflow.runtime.timings import read_timings
 from workflow.settings.batch_table import Line
 
 FOLDER = batch_plan.FOLDER
@@ -132,14 +132,11 @@ def _costs(scene: str) -> Row:
     jobs = read_timings(scene)
     if not jobs:
         return {}
-    own = {job["rule"]: read_parts(scene, job["rule"]).get("job", {}) for job in jobs}
-    cpu = sum(max(job["cpu_seconds"], own[job["rule"]].get("cpu_seconds", 0.0)) for job in jobs)
-    memory = max(max(job["max_rss_mb"], own[job["rule"]].get("max_rss_mb", 0.0)) for job in jobs)
     slowest = max(jobs, key=lambda job: job["seconds"])
     return {
         "seconds": sum(job["seconds"] for job in jobs),
-        "cpu_seconds": cpu,
-        "max_rss_mb": memory,
+        "cpu_seconds": sum(job["cpu_seconds"] for job in jobs),
+        "max_rss_mb": max(job["max_rss_mb"] for job in jobs),
         "slowest": f"{slowest['rule']} {slowest['seconds']:.0f} s",
     }
 

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from iif_core.errors import InputError
 from workflow.artifacts import StageReader
-from workflow.artifacts.files import sha256_of
+from workflow.artifacts.files import facts_in, sha256_of
 from workflow.artifacts.store import MANIFEST
 from workflow.artifacts.verify import with_artefacts
 from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fp
-from workflow.settings import study_files
+from workflow.settings import derived
 from workflow.settings.names import did_you_mean
 
 QUANTITIES = ("albedo", "roughness", "metallic", "emission", "rgb")
@@ -56,8 +55,8 @@ def open_result(name: str, quality: str = "draft") -> Result:
     """
     known = [one for one in with_artefacts() if Path("results", one).is_dir()]
     folders = [name]
-    if study_files.derived(name):
-        folders += study_files.bases(name)
+    if derived.derived(name):
+        folders += derived.bases(name)
     stages = {}
     for stage in STAGES:
         home = _home(stage, name, folders, quality)
@@ -80,10 +79,7 @@ def open_result(name: str, quality: str = "draft") -> Result:
 
 def _scene_in(folder: Path) -> str | None:
     """Return the scene that a manifest names: a result that was copied to keep it under another name can be compared."""
-    try:
-        found = json.loads((folder / MANIFEST).read_bytes())["scene"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
+    found = facts_in(folder / MANIFEST).get("scene")
     return found if isinstance(found, str) else None
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import glob
-import json
 import math
 import os
 from functools import lru_cache
 from pathlib import Path
 
-from workflow.artifacts.files import read_record
+from workflow.artifacts.files import facts_in
 
 LATEST = 120
 """Jobs that are looked at, the latest first."""
@@ -29,10 +28,10 @@ def machine_factor(root: Path = Path("results")) -> float:
     files = sorted(glob.glob(f"{glob.escape(str(root))}/*/benchmarks/*.parts.json"), key=os.path.getmtime, reverse=True)
     total, count = 0.0, 0
     for path in files[:LATEST]:
+        document = facts_in(path)
         try:
-            document = json.loads(read_record(path))
             taken, expected = float(document["job"]["cpu_seconds"]), float(document["expected"]["cpu_seconds"])
-        except (OSError, ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError):
             continue
         if taken >= SHORTEST and expected > 0:
             total += min(max(math.log(taken / expected), -math.log(3)), math.log(3))

@@ -97,21 +97,13 @@ def _options(options: type[Options], section: dict[str, Any], **given: Any) -> O
 def _base(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     base, pixels, faces = settings["base"], size.pixels / MILLION, size.faces / MILLION
     fused = pixels * min(_options(CellOptions, base).predictions or 1 << 30, predictions(settings["prior"]))
-    return "direct", {"predictions": fused, "pixels": pixels, "faces": faces, "cells": _base_cells(settings, size)}
+    return "direct", {"predictions": fused, "pixels": pixels, "faces": faces, "cells": base_cells(settings, size)}
 
 
-def _base_cells(settings: dict[str, Any], size: SceneSize) -> float:
+def base_cells(settings: dict[str, Any], size: SceneSize) -> float:
     """Cells of the base in millions, up to a factor: a view shows as many as it has pixels over the area of a cell, and other
     views show some of them again."""
     return (size.pixels * size.views**-0.5) / settings["base"]["cell_footprints"] ** 2 / MILLION
-
-
-def _base_scores(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
-    return "all", {"pixels": size.pixels / MILLION}
-
-
-def _common_scores(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
-    return "all", {"faces": size.faces / MILLION, "cells": _base_cells(settings, size)}
 
 
 def _emission(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
@@ -154,7 +146,7 @@ def _affines(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, 
     affines, pixels, faces = settings["affines"], size.pixels / MILLION, size.faces / MILLION
     read = pixels if affines["pixels"] == "all" else min(affines["pixels"] / MILLION, pixels)
     kind = "textured" if settings["prior"]["kind"] == "retinex" else "direct"
-    return kind, {"read": read, "pixels": pixels, "faces": faces, "cells": _base_cells(settings, size)}
+    return kind, {"read": read, "pixels": pixels, "faces": faces, "cells": base_cells(settings, size)}
 
 
 def _render(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
@@ -193,7 +185,7 @@ def _metrics(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, 
 
 def _export(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     texels = settings["export"]["texture_size"] ** 2 / MILLION
-    return "all", {"faces": size.faces / MILLION, "cells": _base_cells(settings, size), "texels": texels}
+    return "all", {"faces": size.faces / MILLION, "cells": base_cells(settings, size), "texels": texels}
 
 
 def _unwrap(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
@@ -203,7 +195,7 @@ def _unwrap(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, f
 def _room(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     texels = settings["room"]["lightmap_size"] ** 2 / MILLION
     counts = {"paths": texels * settings["room"]["samples"], "texels": texels, "pixels": size.pixels / MILLION}
-    return "all", {**counts, "faces": size.faces / MILLION, "cells": _base_cells(settings, size)}
+    return "all", {**counts, "faces": size.faces / MILLION, "cells": base_cells(settings, size)}
 
 
 def _report(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
@@ -221,8 +213,6 @@ _STAGES = {
     "prior": _prior,
     "segmentation": _segmentation,
     "base": _base,
-    "base_scores": _base_scores,
-    "common_scores": _common_scores,
     "emission": _emission,
     "shading": _shading,
     "second_look": _second_look,

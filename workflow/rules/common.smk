@@ -23,7 +23,8 @@ from workflow.relighting.check import check_relightings
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import forecast, native
 from workflow.runtime.job_state import written_out
-from workflow.settings import SCENE_NAME, refuse_profile, refuse_target, scene_file, study_files
+from workflow.settings import SCENE_NAME, refuse_profile, refuse_target, scene_file
+from workflow.settings import derived as derived_scenes
 from workflow.settings import prior as prior_settings
 from workflow.settings.names import did_you_mean_path
 from workflow.trade import bench, choose
@@ -122,7 +123,7 @@ def reads(stage, more=None):
         target = f"results/{scene}/{stage}/manifest.json" if stage != "publish" else f"scenes/{scene}"
         faults = or_stop(batch_table.check_stage, stage, scene, quality_of(scene))
         again_if_unsound(target, f"{scene}: stage {stage} is made again", faults)
-        common, one = study_files.shared_scene(scene), STAGES[stage]
+        common, one = derived_scenes.shared_scene(scene), STAGES[stage]
         found = {name: manifest(name, scene) for name in one.upstream}
         found |= {f"{SHARED}{name}": manifest(name, common) for name in one.shared}
         return found | (more(scene) if more else {})

@@ -18,8 +18,6 @@ for number, stage in enumerate(STAGES.values()):
             manifest=f"results/{{scene}}/{stage.name}/manifest.json",
         log:
             f"results/{{scene}}/logs/{stage.name}.log",
-        benchmark:
-            f"results/{{scene}}/benchmarks/{stage.name}.jsonl"
         priority: number
         threads: stage.threads
         resources:

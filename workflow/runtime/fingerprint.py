@@ -19,12 +19,12 @@ from typing import Any
 from iif_core.errors import InputError
 from workflow import plugins
 from workflow import settings as settings_module
-from workflow.artifacts.files import read_record, sha256_of
+from workflow.artifacts.files import facts_in, sha256_of
 from workflow.artifacts.stamps import Stamps
 from workflow.intake.names import shown
 from workflow.registry import STAGES
 from workflow.runtime import input_digests
-from workflow.settings import study_files
+from workflow.settings import derived
 from workflow.settings.names import EXAMPLES
 from workflow.settings.relight import recombines
 
@@ -47,7 +47,6 @@ _HERE = f"{REPOSITORY}/"
 _OWN = tuple(f"{_HERE}{name}/" for name in (*PACKAGES, EXAMPLES))
 NEEDED = tuple(stage.name for stage in STAGES.values() if not stage.on_demand)
 """Stages that every scene needs, in order."""
-VGG = Path("results/weights/lpips_vgg.npz")
 
 
 def module_file(module: str) -> Path | None:
@@ -203,8 +202,7 @@ def raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
 
 
 def _raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
-    wants_vgg = stage == "base_scores" or (stage == "metrics" and document["metrics"]["lpips_vgg"])
-    out = [VGG] if wants_vgg and VGG.is_file() else []
+    out: list[Path] = []
     if stage in ("relight", "lamp_images"):
         entries = document["relight"] if stage == "relight" else [entry for entry in document["relight"] if recombines(entry)]
         out.extend(settings_module.relight_files(entries))
@@ -255,7 +253,7 @@ def fingerprint(stage: str, scene: str, quality: str) -> str:
         "upstream": {up: fingerprint(up, scene, quality) for up in STAGES[stage].upstream},
     }
     if STAGES[stage].shared:
-        shared = study_files.shared_scene(scene)
+        shared = derived.shared_scene(scene)
         facts["shared"] = {up: fingerprint(up, shared, quality) for up in STAGES[stage].shared}
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -263,7 +261,7 @@ def fingerprint(stage: str, scene: str, quality: str) -> str:
 @lru_cache(None)
 def home(stage: str, scene: str, quality: str) -> str:
     """Return the scene in whose folder the result of a stage lies: variants of a study share equal results."""
-    for shared in study_files.bases(scene):
+    for shared in derived.bases(scene):
         if fingerprint(stage, shared, quality) == fingerprint(stage, scene, quality):
             return shared
     return scene
@@ -280,8 +278,4 @@ def missing_stages(scene: str, quality: str) -> list[str]:
 
 def _made(stage: str, scene: str, quality: str) -> str:
     """Return the fingerprint under which a stage was made; empty if it was not, or its manifest cannot be read."""
-    try:
-        document = json.loads(read_record(f"results/{home(stage, scene, quality)}/{stage}/manifest.json"))
-        return str(document.get("fingerprint", ""))
-    except (OSError, ValueError, AttributeError, RecursionError):
-        return ""
+    return str(facts_in(f"results/{home(stage, scene, quality)}/{stage}/manifest.json").get("fingerprint", ""))

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 from iif_core.errors import InputError
-from workflow.artifacts.files import read_record
+from workflow import plugins
+from workflow.artifacts.files import facts_in
 from workflow.costs.machine import machine_factor
 from workflow.costs.model import Cost, Range, predict
 from workflow.costs.size import estimate, size_of_capture
@@ -39,13 +40,10 @@ def scene_size(scene: str, quality: str) -> SceneSize:
     Raises:
         InputError: the settings or the files of the scene cannot be used.
     """
-    home = fingerprints.home("capture", scene, quality)
-    try:
-        manifest = json.loads(read_record(f"results/{home}/capture/manifest.json"))
-        if manifest["fingerprint"] == fingerprints.fingerprint("capture", scene, quality):
+    manifest = facts_in(f"results/{fingerprints.home('capture', scene, quality)}/capture/manifest.json")
+    if manifest.get("fingerprint") == fingerprints.fingerprint("capture", scene, quality):
+        with suppress(ValueError, KeyError, TypeError, IndexError):  # damaged: it will be made again
             return size_of_capture(manifest)
-    except (OSError, ValueError, KeyError, TypeError, IndexError):
-        pass  # not there, or damaged: it will be made
     document = fingerprints.parsed(fingerprints.resolved(scene, quality))
     return estimate(document, fingerprints.raw_inputs("capture", document))
 
@@ -117,7 +115,7 @@ def wall(scene: str, quality: str, cores: int) -> Wall:
         InputError: the settings or files of the scene cannot be used, or a stage is of a kind that was never measured.
     """
     settings = fingerprints.parsed(fingerprints.resolved(scene, quality))
-    rendered = settings["source"]["kind"] in ("builtin", "mitsuba")
+    rendered = plugins.function("SIZES", settings["source"]["kind"]) is not None
     total = [START, START, START]
     for stage in STAGES.values():
         if stage.on_demand or (stage.name == "capture" and rendered):

@@ -12,7 +12,7 @@ import resource
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,11 +21,11 @@ from typing import IO, Any, NamedTuple
 from iif_core.errors import InputError
 from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter, links, stamps
-from workflow.artifacts.files import read_record, write_json
+from workflow.artifacts.files import facts_in, write_json
 from workflow.registry import SHARED, STAGES
 from workflow.runtime import device, forecast
 from workflow.runtime import fingerprint as fp
-from workflow.settings import study_files
+from workflow.settings import derived
 
 _LIBRARIES = ("numpy", "scipy", "mitsuba", "drjit", "open3d", "OpenEXR", "pyarrow", "torch", "snakemake")
 
@@ -107,7 +107,7 @@ class Job:
         """
         if stage not in self.stage.shared:
             raise AssertionError(f"stage {self.stage.name} reads {stage}, which registry.py does not list as shared")
-        return self._reader(stage, study_files.shared_scene(self.scene))
+        return self._reader(stage, derived.shared_scene(self.scene))
 
     def _reader(self, stage: str, of: str) -> StageReader:
         if (stage, of) not in self._readers:
@@ -193,15 +193,12 @@ class Job:
         """Add what the parts of this stage took that ran as jobs of their own to its seconds, and return their peak memories."""
         memories = []
         for path in (Path("results") / self.scene / "benchmarks").glob(f"{self.stage.name}.*-of-*.parts.json"):
-            try:
-                document = json.loads(read_record(path))
+            document = facts_in(path)
+            with suppress(ValueError, KeyError, TypeError):  # damaged
                 spent = {key: float(document["job"][key]) for key in (*self._earlier, "max_rss_mb")}
-                mine = document["fingerprint"] == self.fingerprint
-            except (OSError, ValueError, KeyError, TypeError):
-                mine = False
-            if mine:
-                memories.append(spent.pop("max_rss_mb"))
-                self._earlier = {key: value + spent[key] for key, value in self._earlier.items()}
+                if document["fingerprint"] == self.fingerprint:
+                    memories.append(spent.pop("max_rss_mb"))
+                    self._earlier = {key: value + spent[key] for key, value in self._earlier.items()}
             path.unlink(missing_ok=True)
         return memories
 

@@ -8,7 +8,6 @@ killed without a word. On the same machine the process itself is looked for; for
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import platform
@@ -22,7 +21,7 @@ from typing import Any, NamedTuple
 import psutil
 
 from iif_core.errors import InputError
-from workflow.artifacts.files import read_record, write_json
+from workflow.artifacts.files import facts_in, write_json
 
 BEAT = 15.0
 """Seconds after which a running job renews its file."""
@@ -126,12 +125,12 @@ def noted(path: Path, silence: float = SILENCE) -> Noted | None:
         path: of the file.
         silence: age of the file from which on a job of another machine counts as killed; 0 where no job can run any more.
     """
+    document = facts_in(path)
     try:
         touched = os.stat(path).st_mtime
-        document = json.loads(read_record(path))
-    except (OSError, ValueError, RecursionError):  # also where its job has just ended well
+    except OSError:  # also where its job has just ended well
         return None
-    if not isinstance(document, dict) or document.get("state") not in ("started", "failed"):
+    if document.get("state") not in ("started", "failed"):
         return None
     document = {key: _sound(value) for key, value in document.items() if key in FORMS and type(value) is FORMS[key]}
     state = document["state"]

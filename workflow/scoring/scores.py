@@ -1,4 +1,4 @@
-"""Scores of the material maps of views against ground truth, for the stages metrics and base_scores."""
+"""Scores of the material maps of views against ground truth, for stage metrics and for studies."""
 
 from __future__ import annotations
 

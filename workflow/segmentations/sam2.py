@@ -183,8 +183,7 @@ def label_maps(job: Job, capture: CaptureReader) -> dict[str, np.ndarray]:
     ids, proposals, masks, wrong = (list(column) for column in zip(*rows, strict=True))
     if not any(masks):
         raise InputError(
-            f"SAM 2 found no mask in any of {len(views)} views ({wrong[0]}); lower `segmentation.sam2.confidence`,"
-            " or check the checkpoint"
+            f"SAM 2 found no mask in any of {len(views)} views ({wrong[0]}). Check the checkpoint, or take another `segmentation`"
         )
     if any(wrong):
         job.log.warning("%d of %d views have no masks, or lack some (see masks.parquet)", sum(map(bool, wrong)), len(views))

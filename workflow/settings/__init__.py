@@ -1,13 +1,11 @@
-"""The settings of a scene: one typed model that validates them and generates the JSON schema and the reference page.
+"""The settings of a scene: one typed model that validates them, of which the JSON schema and the reference page are made.
 
-Order of precedence: defaults in this package < `config/quality/<quality>.yaml` < `config/scenes/<scene>.yaml`; for a variant of a
-study (study_files.py) also < `config/studies/scenes.yaml` < `config/studies/<study>.yaml`; for a line of `config/batch.tsv`
-(batch_table.py) its base takes the place of the file of the scene, under the columns of the line. `names.configuration` says when
-these files are those of the working folder and when those of the repository. Nothing else is consulted: no environment variables,
-no hidden files.
+Order of precedence: defaults in this package < `config/quality/<quality>.yaml` < `config/scenes/<scene>.yaml` < what a derived
+scene puts over it (derived.py), such as a plan of relightings; for a line of `config/batch.tsv` (batch_table.py) its base takes
+the place of the file of the scene, under the columns of the line. `names.configuration` says when these files are those of the
+working folder and when those of the repository. Nothing else is consulted: no environment variables, no hidden files.
 """
 
-from workflow.settings.document import plan_schema_json, reference_markdown, schema_json
 from workflow.settings.loading import load, relight_origin, scene_file, scene_origin
 from workflow.settings.names import QUALITIES, RESERVED, SCENE_NAME, scene_names
 from workflow.settings.relight import relight_files, require_relighting
@@ -30,8 +28,6 @@ __all__ = [
     "plan_names",
     "read_yaml",
     "recorded",
-    "plan_schema_json",
-    "reference_markdown",
     "refuse_profile",
     "refuse_target",
     "relight_files",
@@ -40,6 +36,5 @@ __all__ = [
     "scene_file",
     "scene_names",
     "scene_origin",
-    "schema_json",
     "select",
 ]

@@ -16,6 +16,12 @@ from workflow.settings.section import Section
 
 NOT_READ = {
     "affines.ridge": " It was removed, because it had no effect; delete it.",
+    "segmentation.colour": " It is the same for all rooms now; delete it, and set `scale` for other pieces.",
+    "segmentation.sam2.confidence": " It is the same for all rooms now; delete it.",
+    "report.views": " The report shows 6 of them with all maps; delete it.",
+    "source.drop_bad": " Photographs that the release marks as bad are left out; delete it.",
+    "source.ids": " The first of `IndexMA` and `segmentation` that is there has the ids; move the other folder away to read it.",
+    **dict.fromkeys(("source.lists", "source.validation"), " Photographs for testing are held out, never used; delete it."),
 }
 """Keys of earlier versions: what to do about them."""
 SHOWN = 10

@@ -11,7 +11,8 @@ from pydantic import ValidationError
 
 from iif_core.errors import InputError
 from workflow import plugins
-from workflow.settings import batch_table, relight_plans, study_files
+from workflow.settings import batch_table, relight_plans
+from workflow.settings import derived as derived_scenes
 from workflow.settings.explain import explain
 from workflow.settings.names import (
     DEFAULT,
@@ -43,8 +44,8 @@ def merge(lower: dict[str, Any], upper: dict[str, Any]) -> dict[str, Any]:
 
 
 def scene_file(scene: str, root: Path = Path(".")) -> Path:
-    """Return the file of a scene; for a derived scene of a study, the file of the scene that it is derived from, which is
-    `config/studies/scenes.yaml` where that has the scene's `source`.
+    """Return the file of a scene; for a derived scene, the file of the scene that it is derived from, or that of the plug-in that
+    has the scene's `source`.
 
     Raises:
         InputError: no such scene (the message suggests the nearest name), or a name that a scene cannot have.
@@ -57,11 +58,11 @@ def scene_file(scene: str, root: Path = Path(".")) -> Path:
             )
         if scene in RESERVED:
             raise InputError(f"config/scenes/{scene}.yaml: results/ uses {scene!r} otherwise; rename the file")
-    parts = study_files.derived(scene, root)
+    parts = derived_scenes.derived(scene, root)
     scene = parts.scene if parts else scene
     path = scene_path(scene, root)
-    if parts and not path.is_file() and "source" in study_files.scene_overrides(root).get(scene, {}):
-        return study_files.scenes_path(root)
+    if parts and not path.is_file() and (listed_in := derived_scenes.file_of_source(parts, root)):
+        return listed_in
     if not path.is_file():
         files = scene_names(root)
         listed = [line.name for line in batch_table.read_table(root) if line.name not in files]
@@ -85,8 +86,8 @@ def scene_origin(scene: str, root: Path = Path(".")) -> str:
 
 def relight_origin(scene: str, root: Path = Path(".")) -> str:
     """Return where the relightings of a scene are listed, for messages: a plan, or where the scene is described."""
-    parts = study_files.derived(scene, root)
-    if parts is not None and parts.study == study_files.RELIGHT:
+    parts = derived_scenes.derived(scene, root)
+    if parts is not None and parts.study == derived_scenes.RELIGHT:
         return str(relight_plans.FOLDER / f"{parts.variant}.yaml")
     try:
         return scene_origin(scene, root)
@@ -123,32 +124,28 @@ Layers = list[tuple[str, dict[str, Any]]]
 
 def _layers(scene: str, quality: str, root: Path) -> tuple[Layers, Layers, batch_table.Line | None]:
     """Return the layers of the quality, those of the scene over them, and its line of the batch table if it has one."""
-    parts = study_files.derived(scene, root)
-    of_bench = parts is not None and parts.study == study_files.BENCH
+    parts = derived_scenes.derived(scene, root)
+    of_bench = parts is not None and parts.study == derived_scenes.BENCH
     if parts and of_bench:
-        scene, quality = parts.scene, parts.variant
-    of_study = parts is not None and parts.study not in study_files.OWN
-    plan = parts if parts is not None and parts.study == study_files.RELIGHT else None
-    if plan:
-        scene = plan.scene
+        quality = parts.variant
+    if parts and not parts.added:
+        scene = parts.scene
     # What a study compares must not move with what `draft` is.
-    settings = {} if of_study and quality == DEFAULT else _quality(quality, root)
+    settings = {} if parts and parts.added and quality == DEFAULT else _quality(quality, root)
     line = batch_table.find(scene, root)
     if line:
         above = batch_table.layers(line, root)
     else:
         path = scene_file(scene, root)
         shown = path.relative_to(root) if path.is_relative_to(root) else path
-        above = [(str(shown), read_yaml(path))] if path != study_files.scenes_path(root) else []
-        if parts and of_study:
-            above += study_files.layers(parts, root)
-    if plan:
-        above = [*above, *study_files.layers(plan, root)]
+        above = [(str(shown), read_yaml(path))] if path == scene_path(parts.scene if parts else scene, root) else []
+    if parts:
+        above = [*above, *derived_scenes.layers(parts, root)]
     limits = _merged(above).get("limits")
     if isinstance(limits, dict):
         settings = limited(settings, limits)
     below = [(f"config/quality/{quality}.yaml", settings)]
-    return ([*below, ("", study_files.BENCH_HELD_OUT)] if of_bench else below), above, line
+    return ([*below, ("", derived_scenes.BENCH_HELD_OUT)] if of_bench else below), above, line
 
 
 def _blamed(place: str, layers: Layers, dotted: str) -> str:
@@ -169,7 +166,7 @@ def _quality(quality: str, root: Path) -> dict[str, Any]:
         hint = did_you_mean(quality, names)
         raise InputError(f"--config quality={quality}: unknown quality.{hint} Allowed: {', '.join(names)}")
     settings = read_yaml(configuration(f"quality/{quality}.yaml", root))
-    added = (REPOSITORY / folder / f"{quality}.yaml" for folder in plugins.quality_folders())
+    added = (REPOSITORY / folder / f"{quality}.yaml" for folder in plugins.named("QUALITY"))
     for path in (path for path in added if path.is_file()):
         settings = merge(read_yaml(path), settings)
     if "quality" not in settings:

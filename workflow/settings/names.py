@@ -55,7 +55,7 @@ def _scene_folders(root: Path) -> list[Path]:
     """Return the folders with scene files: that of the working folder, or those of the repository and of its plug-ins."""
     first = configuration("scenes", root)
     shipped = first.resolve() == REPOSITORY / "config/scenes"
-    added = plugins.scene_folders() if shipped else []
+    added = plugins.named("SCENES") if shipped else []
     return [first, *(root / folder if (root / folder).is_dir() else REPOSITORY / folder for folder in added)]
 
 

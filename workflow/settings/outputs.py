@@ -40,11 +40,13 @@ class Export(Section):
     """Largest size of `scene.glb` in MB: its textures become JPEG, and then smaller, until it fits."""
 
 
+VIEWS_OF_REPORT = 6
+"""Views that the report shows with all maps, from the worst to the best; each adds up to 2 MB to it."""
+
+
 class Report(Section):
     """The page."""
 
-    views: int = Field(6, ge=1)
-    """Number of views shown with all maps, from the worst to the best; each adds up to 2 MB to the page."""
     credit: str = ""
     """Line under the title, such as artist and licence."""
 

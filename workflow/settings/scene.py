@@ -107,6 +107,7 @@ class SceneSettings(Section):
             "second_look": {"enabled": True},
             "affines": {"textured": self.affines.textured(self.prior.kind)},
             "render": {"denoise": chosen.denoiser != "off"},
+            "report": {"views": outputs.VIEWS_OF_REPORT},
             "room": {"denoise": chosen.denoiser != "off"},
         }
 

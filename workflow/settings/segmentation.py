@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from iif_core.objects.options import ConsensusOptions, PieceOptions, ProposalOptions
+from iif_core.objects.options import ConsensusOptions, PieceOptions
 from workflow import plugins
 from workflow.settings.section import Section
 
@@ -21,9 +21,6 @@ class GivenSegmentation(Section):
 class PiecesOfMesh(Section):
     scale: float = Field(PieceOptions.scale, gt=0)
     """Pieces of the mesh: a larger value gives fewer and larger pieces."""
-    colour: float = Field(PieceOptions.colour, ge=0)
-    """Pieces of the mesh: weight of differences in colour between faces, relative to the angle between them (0 = shape
-    alone)."""
 
 
 class Sam2(Section):
@@ -38,8 +35,6 @@ class Sam2(Section):
     """Set to `true` if you have read the licence of the weights and may use them for this."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """`auto`: the GPU if torch finds one."""
-    confidence: float = Field(ProposalOptions.confidence, ge=0, le=1)
-    """Masks for which the model predicts a smaller intersection over union with the truth are dropped."""
 
 
 class MaskSegmentation(PiecesOfMesh):

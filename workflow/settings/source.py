@@ -77,12 +77,8 @@ class ScanNetppSource(PhotographedSource):
     """Folder of the scene, such as `data/scannetpp/data/2a1b555966`."""
     images: Literal["dslr", "undistorted"] = "dslr"
     """`dslr`: the fisheye `resized_images`, undistorted here; `undistorted`: the images that the toolbox has undistorted."""
-    lists: Literal["all", "train"] = "all"
-    """`all`: hold out the photographs of the test list; `train`: leave them out."""
     world: Literal["nerfstudio", "mesh"] = "nerfstudio"
     """Frame of the poses in transforms.json: as released (rotated against the mesh), or the frame of the mesh."""
-    drop_bad: bool = True
-    """Leave out photographs that the release marks as bad (`is_bad`)."""
 
 
 class FiptSource(PhotographedSource):
@@ -95,10 +91,6 @@ class FiptSource(PhotographedSource):
     """Mesh file inside the folder."""
     unit: Literal["m", "cm", "mm", "km", "ft", "in"] | float = "m"
     """Unit of mesh and camera positions; a number is metres per unit."""
-    validation: Literal["test", "none"] = "test"
-    """Synthetic scenes: hold out the photographs of `val/` (`test`), or leave them out (`none`)."""
-    ids: Literal["auto", "parts", "semantic", "none"] = "auto"
-    """Object ids: `parts` = `IndexMA`, `semantic` = `segmentation`; `auto`: the first of the two that exists."""
 
 
 Source = Annotated[

@@ -93,7 +93,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any]) -> Inputs:
     at = {frame.name: found.at[frame.name] for frame in listed.frames}
     exposures, response, cam = _sensor(found, at) if encoded else ({}, None, [])
     truth = _truth(found, at)
-    ids, lists = _ids(found, source["ids"], at)
+    ids, lists = _ids(found, at)
     frames = tuple(
         replace(f, matrix=f.matrix @ found.flip, exposure=exposures.get(f.name), ids=ids.get(f.name), truth=truth.get(f.name, {}))
         for f in listed.frames
@@ -120,7 +120,7 @@ def _synthetic(home: Path, source: dict[str, Any], encoded: bool) -> Listed:
     found = Listed(home / "train/transforms.json", OPENCV_FROM_LEFT_UP_FORWARD)
     for split in ("train", "val"):
         path = home / split / "transforms.json"
-        if split == "val" and (source["validation"] == "none" or not path.is_file()):
+        if split == "val" and not path.is_file():
             continue
         document = transforms.load(path)
         frames = document.get("frames")
@@ -250,22 +250,17 @@ def _truth(found: Listed, at: dict[str, tuple[Path, int]]) -> dict[str, dict[str
     return out
 
 
-def _ids(found: Listed, wanted: str, at: dict[str, tuple[Path, int]]) -> tuple[dict[str, Path], list[Path]]:
-    """List the id maps of the photographs and the files that say which ids each may contain."""
-    if wanted == "none":
-        return {}, []
-    kinds = IDS if wanted == "auto" else {wanted: IDS[wanted]}
-    kind = next((k for k, below in kinds.items() if all((home / below).is_dir() for home in found.homes)), None)
+def _ids(found: Listed, at: dict[str, tuple[Path, int]]) -> tuple[dict[str, Path], list[Path]]:
+    """List the id maps of the photographs, of the first kind that is there, and the files that say which ids each may contain."""
+    kind = next((k for k, below in IDS.items() if all((home / below).is_dir() for home in found.homes)), None)
     if kind is None:
-        if wanted != "auto":
-            raise InputError(f"{found.homes[0] / IDS[wanted]}: not found; `source.ids` is {wanted}; `auto` takes what is there")
         return {}, []
     files = {}
     for name, (home, i) in at.items():
         files[name] = home / IDS[kind] / (f"{_file(i)}.exr" if kind == "parts" else f"{i:03d}.exr")
     missing = [path for path in files.values() if not path.is_file()]
     if missing:
-        raise InputError(f"{missing[0]}: not found ({len(missing)} id maps are missing); or set `source: {{ids: none}}`")
+        raise InputError(f"{missing[0]}: not found ({len(missing)} id maps are missing); complete or remove the folders")
     lists = [path for home in found.homes if (path := home / IDS[kind] / "object_ids.txt").is_file()]
     return files, lists
 

@@ -71,7 +71,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool =
         made = "the toolbox makes it (dslr.undistort)" if source["images"] == "undistorted" else "it is part of the release"
         raise InputError(f"{cameras}: not found; {made}. `source.images` is {source['images']}; allowed: {', '.join(PLACES)}")
     document = transforms.load(cameras)
-    entries, notes, lists = _entries(document, cameras, dslr, pictures, source)
+    entries, notes, lists = _entries(document, cameras, dslr, pictures)
     entries, without_masks = _masked(entries, masks)
     notes += without_masks
     world = MESH_FROM_NERFSTUDIO if source["world"] == "nerfstudio" else None
@@ -90,9 +90,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool =
     return Inputs(listed, mesh_path, of_vertices=of_vertices)
 
 
-def _entries(
-    document: dict[str, Any], cameras: Path, dslr: Path, pictures: Path, source: dict[str, Any]
-) -> tuple[list[Entry], list[str], list[Path]]:
+def _entries(document: dict[str, Any], cameras: Path, dslr: Path, pictures: Path) -> tuple[list[Entry], list[str], list[Path]]:
     """Return the frames of both lists with their split, notes about those left out, and the list file."""
     entries = [replace(e, split="train") for e in transforms.entries_of(cameras, document)]
     if document.get("test_frames"):
@@ -106,16 +104,11 @@ def _entries(
         without = [name for name in stated if name not in posed]
         if without:
             notes.append(f"{len(without)} listed photographs have no pose and are not used, such as {without[0]}")
-    if source["drop_bad"]:
-        bad = [e for e in entries if e.keys.get("is_bad")]
+    if bad := [e for e in entries if e.keys.get("is_bad")]:
         entries = [e for e in entries if not e.keys.get("is_bad")]
-        if bad:
-            notes.append(f"{len(bad)} photographs that the release marks as bad are left out")
-    tests = [e for e in entries if e.split == "test"]
-    hidden = [e for e in tests if not (pictures / e.file_path).is_file()]
-    if source["lists"] == "train":
-        hidden = tests
-    elif hidden:
+        notes.append(f"{len(bad)} photographs that the release marks as bad are left out")
+    hidden = [e for e in entries if e.split == "test" and not (pictures / e.file_path).is_file()]
+    if hidden:
         notes.append(f"{len(hidden)} test photographs are not in {pictures.name}/ (the release withholds some)")
     gone = {id(e) for e in hidden}
     kept = sorted((e for e in entries if id(e) not in gone), key=lambda entry: entry.file_path)

@@ -14,7 +14,7 @@ from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fp
 from workflow.runtime import forecast
 from workflow.runtime.timings import read_parts
-from workflow.settings.study_files import BENCH, scene_of
+from workflow.settings.derived import BENCH, scene_of
 from workflow.trade.points import SCORES, WORDS, bench_points, measured_scores
 
 HEADS = {"albedo": "albedo / dB", "held_out": "held out / dB"}

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from iif_core.errors import InputError
-from workflow.artifacts.files import write_json
+from workflow.artifacts.files import facts_in, write_json
 from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import forecast
-from workflow.settings import study_files
+from workflow.settings import derived
 from workflow.settings.loading import canonical, overridden, photographs, scene_origin
 from workflow.settings.names import DEFAULT, did_you_mean, quality_names
 from workflow.trade import bench
@@ -104,9 +104,9 @@ def choice(request: Request, scene: str) -> Choice:
     Raises:
         InputError: settings of the scene that cannot be used, seconds that no point keeps to, a score that none reaches.
     """
-    parts = study_files.derived(scene)
+    parts = derived.derived(scene)
     if parts or not request.chooses:
-        return Choice(canonical(parts.variant if parts and parts.study == study_files.BENCH else request.quality))
+        return Choice(canonical(parts.variant if parts and parts.study == derived.BENCH else request.quality))
     return _kept(request, scene) or (_in_time if request.seconds else _to_score)(request, scene)
 
 
@@ -118,13 +118,12 @@ def keep(request: Request, chosen: Mapping[str, Choice]) -> None:
 
 
 def _kept(request: Request, scene: str) -> Choice | None:
+    document = facts_in(_file(scene))
+    made = Choice(str(document.get("quality", "")), str(document.get("line", "")))
     try:
-        document = json.loads(_file(scene).read_text())
-        made = Choice(str(document["quality"]), str(document["line"]))
-        same = _marks(request, scene, made.quality).items() <= document.items()
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, InputError):
+        return made if _marks(request, scene, made.quality).items() <= document.items() else None
+    except InputError:  # there is no such quality any more
         return None
-    return made if same else None
 
 
 def _file(scene: str) -> Path:
@@ -140,7 +139,7 @@ def _marks(request: Request, scene: str, quality: str) -> dict[str, str]:
 
 def fits(stage: str, scene: str) -> bool:
     """Return whether a job makes materials of a scene, whose scores depend on its quality, and no variant of a study."""
-    return not STAGES[stage].on_demand and not study_files.derived(scene)
+    return not STAGES[stage].on_demand and not derived.derived(scene)
 
 
 def told(request: Request, chosen: Mapping[str, Choice]) -> list[str]:
@@ -148,7 +147,7 @@ def told(request: Request, chosen: Mapping[str, Choice]) -> list[str]:
     point = None if request.chooses else point_of(request.quality)
     if not point:
         return [choice.line for choice in chosen.values() if choice.line]
-    scenes = {scene: overridden(scene, request.quality) for scene in chosen if not study_files.derived(scene)}
+    scenes = {scene: overridden(scene, request.quality) for scene in chosen if not derived.derived(scene)}
     own = [f"{scene_origin(scene)} sets {', '.join(changed)} itself" for scene, changed in scenes.items() if changed]
     return [_expectation(request.quality, point), *own[:5], *([f"and {len(own) - 5} more scenes do"] if len(own) > 5 else [])]
 
@@ -160,7 +159,7 @@ def reached(request: Request, scenes: Iterable[str]) -> list[str]:
         folder = Path(f"results/{scene}/metrics")
         try:
             mark = json.loads((folder / "manifest.json").read_text())["fingerprint"]
-            if study_files.derived(scene) or mark != fingerprints.fingerprint("metrics", scene, choice(request, scene).quality):
+            if derived.derived(scene) or mark != fingerprints.fingerprint("metrics", scene, choice(request, scene).quality):
                 continue
             found = measured_scores(json.loads((folder / "summary.json").read_text())).get(request.score)
         except (OSError, ValueError, KeyError, TypeError):

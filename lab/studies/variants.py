@@ -1,10 +1,9 @@
-"""Derived scenes: variants (settings) x seeds of a scene, run by the ordinary rules. Studies of the laboratory are made of them
-(lab/docs/studies.md), and so are benches and plans of relightings.
+"""Variants of studies as derived scenes (lab/docs/studies.md): which settings a variant has, and what it shares with others.
 
-A *derived scene* `<scene>--<study>-<variant>-s<seed>` has the settings of the scene's own file, over them its entry in
-`config/studies/scenes.yaml`, over these `common` of the study and the settings of the variant, and `prior.seed: <seed>`.
+A derived scene `<scene>--<study>-<variant>-s<seed>` has the settings of the scene's own file, over them its entry in
+`lab/config/studies/scenes.yaml`, over these `common` of the study and the settings of the variant, and `prior.seed: <seed>`.
 `<scene>--s<seed>` is the same without study and variant and holds what all studies share: photographs, predictions, segments.
-Of the file of a study, only what changes settings is read here; the laboratory reads and checks the rest (lab/studies/files.py).
+Every job reads this, so of the file of a study only what changes settings is read here; lab/studies/files.py checks the rest.
 """
 
 from __future__ import annotations
@@ -13,35 +12,27 @@ import itertools
 import re
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import ConfigDict, Field, ValidationError
 
 from iif_core.errors import InputError
-from workflow.settings import relight_plans
+from workflow.settings.derived import OWN, STUDY, VARIANT, Derived, scene_of
 from workflow.settings.explain import needed
-from workflow.settings.names import configuration, did_you_mean, scene_names, scene_path
+from workflow.settings.names import REPOSITORY, did_you_mean, scene_names
 from workflow.settings.section import Section
 from workflow.settings.yaml_file import read_yaml
 
-FOLDER = Path("config/studies")
+FOLDER = Path("lab/config/studies")
 SCENES = FOLDER / "scenes.yaml"
-STUDY = r"[a-z][a-z0-9_]*"  # no hyphen: it ends the study's part of a derived scene's name
-_VARIANT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
-_DERIVED = re.compile(
-    rf"(?P<scene>[A-Za-z0-9_-]+?)--(?:(?P<study>{STUDY})-(?P<variant>{_VARIANT.pattern})-)?s(?P<seed>0|[1-9]\d{{0,8}})"
-)
-
 SHARED_VARIANT = "shared"
 """Name of the derived scene at whose views all variants of a study are scored."""
-BENCH = "bench"
-"""The variants of this study are points of the front, of any scene: `<scene>--bench-p03-s0` (workflow/trade/bench.py)."""
-RELIGHT = "relight"
-"""The variants of this study are plans of relightings, of any scene: `<scene>--relight-evening-s0`."""
-OWN = {BENCH: "the points of the front", RELIGHT: "plans of relightings"}
-"""Studies without a file, and what their variants are."""
-BENCH_HELD_OUT = {"capture": {"test_every": 8}}
-"""Set where the scene holds no photograph out."""
+
+
+def configuration(part: str = "", root: Path = Path(".")) -> Path:
+    """Return lab/config/studies, or a part of it: the working folder's where it exists, otherwise the repository's."""
+    own = root / FOLDER / part
+    return own if own.exists() else REPOSITORY / FOLDER / part
 
 
 class Variant(Section):
@@ -54,7 +45,7 @@ class Variant(Section):
     overrides: dict[str, dict[str, Any]] = {}
     """Settings, section by section, over those of the scene."""
     preset: str | None = Field(None, pattern=r"^[a-z][a-z0-9_]*$")
-    """Settings under these, shared by studies: `config/studies/presets/<preset>.yaml`."""
+    """Settings under these, shared by studies: `lab/config/studies/presets/<preset>.yaml`."""
 
     def layer(self, root: Path) -> dict[str, dict[str, Any]]:
         """Return all that the variant sets over the scene.
@@ -64,7 +55,7 @@ class Variant(Section):
         """
         if self.preset is None:
             return dict(self.overrides)
-        file = configuration(f"studies/presets/{self.preset}.yaml", root)
+        file = configuration(f"presets/{self.preset}.yaml", root)
         if not file.is_file():
             known = sorted(path.stem for path in file.parent.glob("*.yaml"))
             hint = did_you_mean(self.preset, known)
@@ -94,7 +85,7 @@ class Design(Section):
 
 
 class Study(Section):
-    """What of one file under config/studies/ changes settings."""
+    """What of one file under lab/config/studies/ changes settings."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -116,18 +107,9 @@ class Study(Section):
 AnyStudy = TypeVar("AnyStudy", bound=Study)
 
 
-class Derived(NamedTuple):
-    """Parts of the name of a derived scene; `study` and `variant` are empty for what all studies share."""
-
-    scene: str
-    study: str
-    variant: str
-    seed: int
-
-
 def study_names(root: Path = Path(".")) -> list[str]:
     """Return the name of every study that has a file, sorted."""
-    return sorted(path.stem for path in configuration("studies", root).glob("*.yaml") if path.name != SCENES.name)
+    return sorted(path.stem for path in configuration("", root).glob("*.yaml") if path.name != SCENES.name)
 
 
 def load_study(name: str, root: Path = Path(".")) -> Study:
@@ -157,7 +139,7 @@ def study_path(name: str, root: Path = Path(".")) -> tuple[Path, Path]:
         )
     if not re.fullmatch(STUDY, name):
         raise InputError(f"{path}: name of a study {name!r}: use lower-case letters, digits and _, starting with a letter")
-    return path, configuration("studies", root) / path.name
+    return path, configuration("", root) / path.name
 
 
 @lru_cache(64)
@@ -188,7 +170,7 @@ def expanded(study: AnyStudy, path: Path, kind: type[Variant] = Variant) -> AnyS
     if study.shared and SHARED_VARIANT in variants:
         raise InputError(f"{path}: a variant cannot be called {SHARED_VARIANT}, which is the capture of `shared`; rename it")
     for name in variants:
-        if not _VARIANT.fullmatch(name):
+        if not re.fullmatch(VARIANT, name):
             raise InputError(
                 f"{path}: `variants`: found the name {name!r}; use letters, digits, _ and -, starting with a letter or digit"
             )
@@ -231,14 +213,9 @@ def _design(design: Design, path: Path, others: dict[str, Variant], kind: type[V
     return out
 
 
-def scenes_path(root: Path = Path(".")) -> Path:
-    """Return where the settings lie that every study uses for a scene (config/studies/scenes.yaml)."""
-    return configuration("studies", root) / SCENES.name
-
-
 def scene_overrides(root: Path = Path(".")) -> dict[str, dict[str, Any]]:
     """Return scene -> settings that every study uses for it; an entry with a `source` needs no scene of that name."""
-    path = scenes_path(root)
+    path = configuration("", root) / SCENES.name
     if not path.is_file():
         raise InputError(f"{SCENES}: not found; it lists the scenes of the studies (lab/docs/studies.md)")
     document = read_yaml(path)
@@ -254,22 +231,13 @@ def scene_overrides(root: Path = Path(".")) -> dict[str, dict[str, Any]]:
     return {scene: overrides or {} for scene, overrides in document.items()}
 
 
-def derived(name: str, root: Path = Path(".")) -> Derived | None:
-    """Return the parts of the name of a derived scene; None for a scene with its own file, or for any other name."""
-    if "--" not in name or scene_path(name, root).is_file():
-        return None
-    match = _DERIVED.fullmatch(name)
-    if not match:
-        return None
-    return Derived(match["scene"], match["study"] or "", match["variant"] or "", int(match["seed"]))
+def file_of_source(scene: str, root: Path = Path(".")) -> Path | None:
+    """Return the list of the scenes of studies if it has the `source` of this scene, else None."""
+    return configuration("", root) / SCENES.name if "source" in scene_overrides(root).get(scene, {}) else None
 
 
 def layers(parts: Derived, root: Path = Path(".")) -> list[tuple[str, dict[str, Any]]]:
     """Return (place, settings) of the layers that a derived scene puts over the file of its scene, in order."""
-    if parts.study == BENCH:
-        return []
-    if parts.study == RELIGHT:
-        return [relight_plans.plan_layer(parts.variant, root)]
     shared = scene_overrides(root)
     if parts.scene not in shared:
         raise InputError(f"{SCENES}: {parts.scene} is not listed. Known there: {', '.join(shared) or 'none'}.")
@@ -290,18 +258,14 @@ def layers(parts: Derived, root: Path = Path(".")) -> list[tuple[str, dict[str, 
     return [*out, ("seed of the study", {"prior": {"seed": parts.seed}})]
 
 
-def bases(name: str, root: Path = Path(".")) -> list[str]:
-    """Return the derived scenes whose folders may hold results that `name` shares, the most general first.
+def bases(parts: Derived, root: Path = Path(".")) -> list[str]:
+    """Return the derived scenes whose folders may hold results that this one shares, the most general first.
 
-    These are what all studies share, then the variants of the same study up to `name`, with the first seed and with the seed of
-    `name`. A variant that differs late, such as a baseline of the material fit, thus finds everything before it in the folder of
-    the first variant.
+    These are what all studies share, then the variants of the same study up to this one, with the first seed and with its own.
+    A variant that differs late, such as a baseline of the material fit, thus finds everything before it in the folder of the
+    first variant.
     """
-    parts = derived(name, root)
-    if parts is None or parts.study == BENCH:
-        return []
-    if parts.study == RELIGHT:
-        return [parts.scene]
+    name = scene_of(parts.study, parts.scene, parts.variant, parts.seed) if parts.study else f"{parts.scene}--s{parts.seed}"
     candidates = [f"{parts.scene}--s0", f"{parts.scene}--s{parts.seed}"]
     if parts.study:
         study = load_study(parts.study, root)
@@ -313,23 +277,11 @@ def bases(name: str, root: Path = Path(".")) -> list[str]:
     return candidates[: candidates.index(name)] if name in candidates else candidates
 
 
-def shared_scene(name: str, root: Path = Path(".")) -> str:
-    """Return the scene whose photographs all variants and seeds of a derived scene are compared at; any other scene is its own.
+def shared_scene(parts: Derived, root: Path = Path(".")) -> str:
+    """Return the scene whose photographs all variants and seeds of a derived scene are compared at.
 
-    >>> shared_scene("kitchen--aggregation-full-s2"), shared_scene("kitchen")
-    ('kitchen--s0', 'kitchen')
+    >>> shared_scene(Derived("kitchen", "aggregation", "full", 2))
+    'kitchen--s0'
     """
-    parts = derived(name, root)
-    if parts is None:
-        return name
-    study = load_study(parts.study, root) if parts.study and parts.study not in OWN else None
-    return scene_of(parts.study, parts.scene, SHARED_VARIANT, 0) if study and study.shared else f"{parts.scene}--s0"
-
-
-def scene_of(study: str, scene: str, variant: str, seed: int) -> str:
-    """Return the name of a derived scene.
-
-    >>> scene_of("aggregation", "kitchen", "full", 0)
-    'kitchen--aggregation-full-s0'
-    """
-    return f"{scene}--{study}-{variant}-s{seed}"
+    shared = parts.study and load_study(parts.study, root).shared
+    return scene_of(parts.study, parts.scene, SHARED_VARIANT, 0) if shared else f"{parts.scene}--s0"

@@ -1,28 +1,25 @@
-"""The settings as a JSON schema and as a page."""
+"""Writes what is made from the settings, their page and the JSON schemas for editors: `python docs/site/settings_page.py`."""
 
 from __future__ import annotations
 
 import json
+import sys
+from pathlib import Path
 from typing import Any, get_origin
 
 from pydantic.fields import FieldInfo
 
-from workflow.settings.relight import RelightPlan
-from workflow.settings.scene import UNIONS, SceneSettings, section_in
-from workflow.settings.section import Section
+REPOSITORY = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(REPOSITORY))
+
+from workflow import plugins  # noqa: E402
+from workflow.settings.relight import RelightPlan  # noqa: E402
+from workflow.settings.scene import UNIONS, SceneSettings, section_in  # noqa: E402
+from workflow.settings.section import Section  # noqa: E402
 
 
-def schema_json() -> str:
-    """Return the JSON schema of a scene file, for editors (`config/scene.schema.json`)."""
-    return _schema(SceneSettings)
-
-
-def plan_schema_json() -> str:
-    """Return the JSON schema of a plan of relightings, for editors (`config/relight.schema.json`)."""
-    return _schema(RelightPlan)
-
-
-def _schema(model: type[Section]) -> str:
+def schema_of(model: type[Section]) -> str:
+    """Return the JSON schema of a file of settings: of a scene, or of a plan of relightings."""
     schema = model.model_json_schema()
     return json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}, indent=1) + "\n"
 
@@ -69,7 +66,7 @@ PARTS = {
 
 def reference_markdown() -> str:
     """Return the settings as a page: key, default, allowed values, meaning (docs/reference/settings.md)."""
-    lines = ["# Settings", "", "Made from `workflow/settings/` by `python -m workflow.settings`; do not edit.", ""]
+    lines = ["# Settings", "", "Made from `workflow/settings/` by `python docs/site/settings_page.py`; do not edit.", ""]
 
     def rows(model: type[Section], prefix: str, kind: str = "", known: dict[str, str] | None = None) -> None:
         """Add the table of a section; a line that an earlier kind has (`known`: line -> kind) is named and not repeated."""
@@ -122,3 +119,19 @@ def reference_markdown() -> str:
             if advanced.get(name, FIRST) == title:
                 section_lines(name, field)
     return "\n".join(lines)
+
+
+def written() -> dict[str, str]:
+    """Return file, relative to the repository -> its text."""
+    return {
+        "config/scene.schema.json": schema_of(SceneSettings),
+        "config/relight.schema.json": schema_of(RelightPlan),
+        "docs/reference/settings.md": reference_markdown(),
+    }
+
+
+if __name__ == "__main__":
+    if plugins.modules():
+        sys.exit(f"{plugins.VARIABLE}: these files describe the product without plug-ins; unset the variable and run this again")
+    for name, text in written().items():
+        (REPOSITORY / name).write_text(text)
