@@ -16,6 +16,7 @@ from iif_core.fusion.selection import selection_weights
 from iif_core.light import environment
 from iif_core.numerics import color, frames, laplace, normal_tail, xp
 from iif_core.reflectance import brdf
+from lab.published.fusion import divergence
 from lab.stability.scalar import Argument, Form, Kernel
 from workflow.runtime import device
 
@@ -217,7 +218,7 @@ def _selection(temperature: float) -> Kernel:
 
 FUSION = [
     Kernel("Laplace divergence", _kl, ("KL",), {"d": DISTANCE, "b_ref": SCALE, "b_pred": SCALE},
-           of_numpy(laplace.kl, np.float32, np.float64), _equal_scales),
+           of_numpy(divergence.kl, np.float32, np.float64), _equal_scales),
     Kernel("weight of the divergence", _kl_weight, ("w",), {"d": DISTANCE, "b_ref": SCALE, "b_pred": SCALE},
            of_numpy(laplace.kl_weight, np.float32, np.float64)),
     Kernel("contribution to a scale", _contribution, ("E|x|",), {"d": DISTANCE, "b_ref": SCALE},

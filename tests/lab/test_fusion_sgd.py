@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from iif_core.fusion.direct import solve_direct
-from iif_core.fusion.kernels import IDENTITY, as_words
+from iif_core.fusion.kernels import as_words
 from iif_core.fusion.options import FusionOptions
 from iif_core.fusion.problem import LOWEST, NEUTRAL, FusionProblem
-from iif_core.reflectance.material import unclamped_material
+from iif_core.reflectance.material import IDENTITY, unclamped_material
 from lab.published.fusion.hashgrid.levels import HashGridOptions
 from lab.published.fusion.reference_loss import loss_of_result
 from lab.published.fusion.sgd import engine, kernels, solve
@@ -34,7 +34,7 @@ SMALL_GRID = HashGridOptions(levels=6, log2_entries=12, base_resolution=8, growt
 def state(k, seed=0, n=150, segments=4, spread=0.15, low=0.0):
     """Parameters and a batch sorted by segment, float64."""
     rng = np.random.default_rng(seed)
-    affine = np.tile(IDENTITY.astype(np.float64), (segments, k, 1)) + spread * rng.standard_normal((segments, k, 16))
+    affine = np.tile(IDENTITY, (segments, k, 1)) + spread * rng.standard_normal((segments, k, 16))
     usable = np.ones((segments, k), bool)
     if k > 2:
         usable[1, 0] = usable[1, 2] = False
