@@ -31,6 +31,7 @@ from tests.errors import named, refused
 from tests.oracles import gltf_viewer
 from tests.oracles.blender import read_by_blender, require_bpy
 from tests.oracles.exported import maps_of, read_back
+from tests.oracles.mitsuba_lobes import metal_reflectance
 from workflow.exporters.atlas import (
     Atlas,
     TexturedPart,
@@ -44,6 +45,7 @@ from workflow.exporters.atlas import (
 )
 from workflow.exporters.camera_files import cameras_json
 from workflow.exporters.glb import fitting_glb, glb_bytes, rotation_to_y
+from workflow.exporters.mitsuba_lobes import METAL
 from workflow.exporters.mitsuba_scene import mitsuba_files
 from workflow.exporters.normal_map import normal_picture
 from workflow.exporters.surface import SeenSurface, build_parts, seen_sides, up_axis
@@ -770,6 +772,10 @@ def own_render(scene, camera, samples):
     world = Scene(geometry, material, scene.light.emitters(geometry))
     image = render(world, pose[:3, 3], rays.reshape(-1, 3), PathOptions(samples, 8, 1), jitter)
     return image.reshape(camera.height, camera.width, 3)
+
+
+def test_the_table_of_mitsubas_metal_is_what_the_plug_in_gives(mi):
+    np.testing.assert_allclose(METAL, metal_reflectance(), rtol=1e-5)
 
 
 def test_mitsuba_renders_what_we_render(mi, tmp_path, monkeypatch):
