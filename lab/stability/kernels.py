@@ -220,7 +220,7 @@ FUSION = [
     Kernel("Laplace divergence", _kl, ("KL",), {"d": DISTANCE, "b_ref": SCALE, "b_pred": SCALE},
            of_numpy(divergence.kl, np.float32, np.float64), _equal_scales),
     Kernel("weight of the divergence", _kl_weight, ("w",), {"d": DISTANCE, "b_ref": SCALE, "b_pred": SCALE},
-           of_numpy(laplace.kl_weight, np.float32, np.float64)),
+           of_numpy(divergence.kl_weight, np.float32, np.float64)),
     Kernel("contribution to a scale", _contribution, ("E|x|",), {"d": DISTANCE, "b_ref": SCALE},
            of_numpy(laplace.scale_contribution, np.float32, np.float64)),
     *(_selection(temperature) for temperature in (1e-12, 0.05, 1.0, 1e6)),

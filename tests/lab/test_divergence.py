@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from iif_core.numerics import laplace
@@ -9,6 +11,7 @@ from lab.published.fusion import divergence
 from tests.errors import refused
 
 CHECKED = [(0.3, 0.1, 0.2, 1.2180407), (0.05, 0.3, 0.1, 0.9408329), (0.0, 0.1, 0.1, 0.0)]
+unit = st.floats(0, 1)
 
 
 @pytest.mark.parametrize(("d", "b_r", "b_p", "expected"), CHECKED)
@@ -64,3 +67,33 @@ def test_reference_scale():
     v = np.array([[0.1], [0.2], [0.5], [0.9]])
     assert divergence.reference_scale(np.array([0.2]), v) == pytest.approx(0.1)  # |.| = .1 0 .3 .7 -> .1
     assert divergence.reference_scale(np.array([0.4]), np.array([[0.4]])) == laplace.SCALE_FLOOR  # K = 1
+
+
+@settings(max_examples=200, deadline=None)
+@given(unit, unit, unit, st.sampled_from([1e-2, 1e-6, 1e-30]))
+def test_kl_is_finite_and_not_negative_down_to_zero_scale(d, b_r, b_p, floor):
+    with np.errstate(under="ignore"):
+        value = divergence.kl(np.float64(d), np.float64(b_r), np.float64(b_p), floor)
+        slope = -np.expm1(-d / laplace.floored(b_r, floor)) / laplace.floored(b_p, floor)  # dKL / dd
+        weight = divergence.kl_weight(np.float64(d), np.float64(b_r), np.float64(b_p), floor)
+    assert np.isfinite(value) and value >= 0
+    assert np.isfinite(weight) and weight > 0
+    # the weight is the slope over the distance, so it majorises with the right tangent
+    assert weight * d == pytest.approx(slope, rel=1e-6, abs=1e-12)
+
+
+def test_weighted_least_squares_with_kl_weight_minimises_the_sum():
+    rng = np.random.default_rng(5)
+    x = np.r_[0.5 + 0.02 * rng.standard_normal(20), 0.95, 0.05, 0.99]
+    mu = x.mean()
+    for _ in range(200):
+        w = divergence.kl_weight(x - mu, 0.02, 0.05)
+        mu = np.sum(w * x) / w.sum()
+    grid = np.linspace(0, 1, 20001)
+    best = grid[np.argmin(divergence.kl(x[:, None] - grid, 0.02, 0.05).sum(0))]
+    assert mu == pytest.approx(best, abs=1e-4)
+
+
+def test_floor_must_be_positive():
+    with refused("floor", "0.0", "0.01"):
+        divergence.kl(0.1, 0.1, 0.1, floor=0.0)

@@ -9,7 +9,6 @@ import torch
 
 from iif_core.fusion.direct import solve_direct
 from iif_core.fusion.kernels import as_words
-from iif_core.fusion.options import FusionOptions
 from iif_core.fusion.problem import LOWEST, NEUTRAL, FusionProblem
 from iif_core.reflectance.material import IDENTITY, unclamped_material
 from lab.published.fusion.hashgrid.levels import HashGridOptions
@@ -18,6 +17,7 @@ from lab.published.fusion.sgd import engine, kernels, solve
 from lab.published.fusion.sgd import pool as sgd_pool
 from lab.published.fusion.sgd.options import SgdOptions, sgd_options
 from lab.published.fusion.sgd.solve import SgdState, converged, solve_sgd
+from lab.published.fusion.variants import solve_variant
 from tests.errors import refused
 from tests.oracles import torch_sgd
 from tests.oracles.label_loss import label_loss
@@ -289,7 +289,7 @@ def test_loss_falls_in_the_history():
     assert found.total == pytest.approx(after["total"], rel=0.02)
     regulariser = found.regulariser_albedo + found.regulariser_roughness + found.regulariser_metallic
     assert regulariser == pytest.approx(after["regulariser"], rel=0.02)
-    mean = solve_direct(problem, FusionOptions("texel_mean"))
+    mean = solve_variant(problem, "texel_mean")
     assert oracle_psnr(problem, fit.value, truth) > oracle_psnr(problem, mean.value, truth) + 0.3
     assert fit.value.shape == fit.scale.shape == (problem.n_cells, 5) and fit.scale.min() >= 0.01
     assert (fit.value >= LOWEST).all() and (fit.value <= 1).all()

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from iif_core.errors import InputError
 from iif_core.fusion import kernels
 from iif_core.fusion.direct import alternate
 from iif_core.fusion.fusion_pass import FusionPass, first_pass
@@ -53,11 +52,9 @@ def solve_distribution(
         The base texture with its maps, selection and uncertainty.
 
     Raises:
-        InputError: the variant makes no selection, or as `solve_direct`.
+        InputError: as `solve_direct`.
     """
     options = options or FusionOptions()
-    if options.variant != "full":
-        raise InputError(f"`objective: distribution` needs a selection; `variant: {options.variant}` makes none")
     # With a given selection maps and texture start again, so further sweeps of least squares would be lost.
     sweeps = 1 if chosen is not None else options.sweeps
 
@@ -102,8 +99,7 @@ def describe_fit(
     Raises:
         InputError: shapes that do not match, ids out of range, a segment in two views.
     """
-    # Only the first texture depends on the variant, and nothing here reads it.
-    run, _ = first_pass(problem, FusionOptions("texel_mean", memory=memory), threads)
+    run, _ = first_pass(problem, FusionOptions(memory=memory), threads)
     run.state.affine, run.state.alpha = affine.astype(np.float64), weight.astype(np.float64)
     texture = np.clip(value, LOWEST, 1.0).astype(np.float32)
     measure_errors(run, texture)

@@ -1,4 +1,4 @@
-"""The divergence of two Laplace distributions, and the scale of the reference (docs/method/fusion.md, Eqs. F.4, F.7).
+"""The divergence of two Laplace distributions, its weight, and the scale of the reference (Eqs. F.4, F.7, F.32).
 
 Scales are floored as in `iif_core.numerics.laplace`; arrays may have any shapes that broadcast, float32 or float64.
 """
@@ -52,6 +52,26 @@ def _above_tangent(x: NDArray) -> NDArray:
     for coefficient in reversed(_SERIES[:-1]):
         series = series * small + coefficient
     return np.where(x < _SMALL, 0.5 * small * small * series, x + np.expm1(-x))
+
+
+def kl_weight(distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float = SCALE_FLOOR) -> NDArray:
+    """Compute the weight of the quadratic function of d that majorises `kl` (Eq. F.32).
+
+    w = (1 - exp(-d / b_r)) / (d b_p), with the limit 1 / (b_r b_p) at d = 0 (docs/method/numerics.md#weight-of-a-zero-residual).
+    Least squares, reweighted with w, minimises the summed divergence over the location. The weight falls as 1 / d, so the
+    influence of an outlier is bounded.
+
+    Args:
+        distance, b_ref, b_pred, floor: as for `kl`.
+
+    Returns:
+        Weight > 0.
+    """
+    d = np.abs(distance)
+    b_r, b_p = floored(b_ref, floor), floored(b_pred, floor)
+    x = d / b_r
+    ratio = np.where(x > 0, -np.expm1(-x) / np.where(x > 0, x, 1.0), 1.0)
+    return ratio / (b_r * b_p)
 
 
 def lower_median(values: NDArray) -> NDArray:
