@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lab.sources.rendered import RenderedWriter
 from workflow.models.denoise import NOTE, denoise, require_denoiser
-from workflow.scene.normal_form import CaptureWriter, Truth, View
+from workflow.scene.normal_form import Truth, View
 
 if TYPE_CHECKING:
     from lab.rooms.room import Room
@@ -53,7 +54,7 @@ class _Capture:
         from iif_core.light.transport.geometry import build_geometry
 
         self.job, self.settings, self.room = job, job.settings.capture, room
-        self.writer = CaptureWriter(job.writer)
+        self.writer = RenderedWriter(job.writer)
         self.geometry = build_geometry(room.vertices, room.faces, room.object_id)
         front = np.ones(len(room.faces), np.int8)
         outside = {} if room.environment is None else {"environment": room.environment}
