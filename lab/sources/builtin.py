@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lab.sources.rendered import RenderedWriter
-from workflow.models.denoise import NOTE, denoise, require_denoiser
+from lab.sources.rendered import DENOISED, RenderedWriter
+from workflow.models.denoise import denoise, require_denoiser
 from workflow.scene.normal_form import Truth, View
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ class _Capture:
         if self.response is not None:
             notes.append(f"8-bit photographs through the response `{self.response.name}`; exposures differ")
         if self.settings.denoise:
-            notes.append(NOTE)
+            notes.append(DENOISED)
         coverage = {"seen_once": round(once, 4), "seen_twice": round(twice, 4), "points": COVERAGE_POINTS}
         facts = {"room": self.room.name, "coverage": coverage}
         samples = None if self.response is None else self.response.samples()

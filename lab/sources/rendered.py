@@ -9,6 +9,9 @@ import numpy as np
 from workflow.artifacts.store import rgb
 from workflow.scene.normal_form import CaptureWriter, Truth
 
+DENOISED = "photographs denoised (Intel Open Image Denoise): biased, and so is the radiance truth"
+"""What a capture says of photographs that were denoised."""
+
 
 class RenderedWriter(CaptureWriter):
     """Writes the normal form; a job that is killed and started again takes over the views that it had rendered."""
