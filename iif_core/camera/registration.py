@@ -149,15 +149,6 @@ def photo_edges(feature: np.ndarray, blur: float) -> np.ndarray:
     return np.clip(size / max(float(np.quantile(size, 0.95)), 1e-9), 0.0, 1.0)
 
 
-def first_step(photos: Sequence[Photo], points: int = 12_000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the normal equations of the first step of `register`, (6 V + 3, 6 V + 3) and (6 V + 3,), and its solution, for
-    measurements of their arithmetic."""
-    features = [feature_image(p.image, p.usable) for p in photos]
-    maps, start = [_Maps.of(f, BLURS[0]) for f in features], _Cameras.of(photos)
-    normal, right = normal_equations(photos, maps, start, _overlap(photos, features, points), [_edge_points(p) for p in photos])
-    return normal, right, np.linalg.solve(normal, right)
-
-
 def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = True, poses: bool = True) -> Registration:
     """Correct poses and common intrinsics so that the photographs fit the mesh and each other.
 

@@ -36,9 +36,6 @@ PROTOCOLS_OF: dict[str, tuple[ProtocolName, ...]] = {
 }
 """Quantity -> protocols. Photographs determine the level of roughness and metallic, but they may leave the level of emission and
 albedo open."""
-RELIT_PROTOCOLS: tuple[ProtocolName, ...] = ("raw", "gain", "scaled")
-RELIT = ("relit_lamp", "relit_moved", "relit_environment", "relit_sphere")
-"""Pictures under new light: a lamp alone, a moved lamp, an environment, a glowing sphere."""
 
 
 class Metric(NamedTuple):

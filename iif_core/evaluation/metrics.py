@@ -107,23 +107,6 @@ def _planes(image: Array) -> Array:
     return image[None] if image.ndim == 2 else np.ascontiguousarray(np.moveaxis(image, -1, 0))
 
 
-def flip(prediction: Array, truth: Array, mask: Array, encoded: bool = False) -> float:
-    """Compute LDR-FLIP, the mean over the masked pixels, 0 = same (Eq. E.6).
-
-    Args:
-        prediction, truth: (H, W, 3); pixels that do not count get the truth on both sides.
-        mask: (H, W) bool.
-        encoded: whether the images are sRGB-encoded instead of linear.
-
-    Returns:
-        Mean in [0, 1].
-    """
-    truth = np.where(np.isfinite(truth), truth, 0)
-    filled = np.where(mask[..., None], prediction, truth)
-    images = (Seen(np.clip(image, 0, 1), encoded) for image in (filled, truth))
-    return float(difference(*images)[mask].mean(dtype=np.float64))
-
-
 def log_l2(prediction: Array, truth: Array, mask: Array) -> float:
     """Compute the mean squared error of log(1 + x) of radiance; negative values count as 0 (Eq. E.8)."""
     difference = np.log1p(np.maximum(prediction[mask].astype(np.float64), 0)) - np.log1p(np.maximum(truth[mask], 0))

@@ -123,21 +123,6 @@ class Terms:
             getattr(self, name)[objects] = getattr(other, name)[objects]
 
 
-def darkest_and_tone(problem: FitProblem, response: Response, chunk: int) -> tuple[float, Tone]:
-    """Return what `prepare_pixels` finds from all pixels, looking at `chunk` of them together.
-
-    These are the light below which pixels are left out (docs/method/numerics.md#pixels-without-light), a thousandth of the median
-    of exposure times diffuse light over pixels that are finite, exposed, and of an object; and the curve that residuals are
-    measured in.
-    """
-    parts = [problem.take(slice(first, first + chunk)) for first in range(0, len(problem.object_id), chunk)]
-    # The parts are views. Looking at one after another keeps the temporary arrays small.
-    use = np.concatenate([_finite(part) for part in parts] or [np.zeros(0, bool)])
-    brightness = np.concatenate([_brightness(part) for part in parts] or [np.zeros(0)])
-    darkest = 1e-3 * float(np.median(brightness[use])) if use.any() else 0.0
-    return darkest, make_tone(response, problem.value[use & (brightness > darkest)])
-
-
 def _finite(problem: FitProblem) -> np.ndarray:
     """Which pixels are finite, exposed, and of an object, (n,) bool."""
     ids = np.asarray(problem.object_id)
@@ -168,7 +153,7 @@ def prepare_pixels(
         problem: pixels with base values and cached shading; response: start of the fit.
         fewest: objects with fewer usable pixels are left out; most: largest number of pixels of an object, spread evenly over its
             clusters; None: all.
-        of_all: light below which pixels are left out, and curve, where these pixels are a part (`darkest_and_tone`); None: those
+        of_all: light below which pixels are left out, and curve, where these pixels are a part of more; None: those
             of these pixels.
 
     Returns:

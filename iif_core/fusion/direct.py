@@ -21,10 +21,9 @@ from iif_core.fusion.fusion_pass import FusionPass, first_pass
 from iif_core.fusion.gauge import Parts, anchor_shifts, seam_shifts
 from iif_core.fusion.options import FusionOptions
 from iif_core.fusion.outcome import build_result
-from iif_core.fusion.problem import LOWEST, FusionProblem, FusionResult, object_means
+from iif_core.fusion.problem import LOWEST, FusionProblem, FusionResult
 from iif_core.fusion.selection import selection_weights
 from iif_core.fusion.sums import NO_MASK, PROPERTY_OF_ENTRY, CellSums, SegmentState, SegmentSums, sweep_summary
-from iif_core.numerics import laplace
 
 _BIAS = [3, 7, 11, 13, 15]  # entries of the CROSS layout that multiply 1
 
@@ -50,9 +49,7 @@ def solve_direct(
         InputError: shapes that do not match, ids out of range, a segment in two views.
     """
     options = options or FusionOptions()
-    means = options.variant in ("texel_mean", "object_mean")
-    sweeps = 1 if means else options.sweeps  # the maps of a mean are the identity, so a second sweep would change nothing
-    total = sweeps + 2  # 2: the first pass, and the one that measures the scales
+    total = options.sweeps + 2  # 2: the first pass, and the one that measures the scales
 
     def notify(done: int) -> None:
         if progress is not None:
@@ -61,17 +58,14 @@ def solve_direct(
     # -------- maps, selection and texture in turn (Eq. F.23 to F.30) --------
     run, texture = first_pass(problem, options, threads)
     notify(1)
-    texture, history = alternate(run, texture, sweeps, notify)
+    texture, history = alternate(run, texture, options.sweeps, notify)
     # -------- the seams between parts (Eq. F.41 to F.43) --------
-    if options.seams and not means and problem.neighbours is not None:
+    if options.seams and problem.neighbours is not None:
         spread = _level_spread(run.parts, run.sums)
         shift, _ = seam_shifts(run.parts, texture, run.counts.weight, problem.neighbours, spread)
         texture = _shifted(run.parts, shift, texture, run.state)
     # -------- range, errors, description --------
     texture = np.clip(texture, LOWEST, 1.0)
-    if options.variant == "object_mean":
-        object_value, _ = object_means(texture, problem.object_of_cell, run.counts.weight)
-        texture = object_value[problem.object_of_cell]
     result = build_result(run, texture, history)
     notify(total)
     return result
@@ -91,14 +85,11 @@ def alternate(
             temperature = options.final_temperature
         cells = CellSums(run.problem.n_cells)
         for block, mixed in run.map_views(partial(_sweep_view, run, texture, temperature)):
-            # From the second sweep on, the texture consists of corrected predictions, and a distance from it marks an outlier
-            # (text after Eq. F.30).
-            cells.add(block.cell, mixed, _robust_weight(block, mixed, texture, options) if sweep else block.weight)
+            cells.add(block.cell, mixed, block.weight)
         updated = cells.mean(texture)
-        if options.variant not in ("texel_mean", "object_mean"):
-            # The reference is the first texture, whose level is set by the medians of the raw predictions (Eq. F.38).
-            shift = anchor_shifts(run.parts, first, updated, counts.weight)
-            updated = _shifted(run.parts, shift, updated, state)
+        # The reference is the first texture, whose level is set by the medians of the raw predictions (Eq. F.38).
+        shift = anchor_shifts(run.parts, first, updated, counts.weight)
+        updated = _shifted(run.parts, shift, updated, state)
         seen = counts.weight > 0
         change = float(np.sqrt(np.mean((updated - texture)[seen] ** 2, dtype=np.float64))) if seen.any() else 0.0
         texture = updated
@@ -112,24 +103,23 @@ def _sweep_view(run: FusionPass, texture: NDArray, temperature: float, view: int
 
     Writes only the rows of this view's segments in `run.state`, so views can run in parallel.
     """
-    options, sums, state = run.options, run.sums, run.state
+    sums, state = run.sums, run.state
     block = run.blocks(view)
     rows = block.segments
     # -------- affine maps (Eq. F.25), float64, from products (s, K, CROSS) --------
     values, target = block.values, kernels.texture_at(texture, block.cell)
     weight = sums.fit_weight(block)
     cross = kernels.cross(values, target, weight, block.start, NO_MASK)
-    if options.variant in ("full", "uniform"):
-        albedo = cross
-        if sums.masked[rows].any():
-            # Where the Gram matrix leaves out clipped pixels, the products must leave out the same ones.
-            inside = kernels.cross(values, target, weight, block.start, block.inside)
-            albedo = np.where(sums.masked[rows][..., None], inside, cross)
-        state.affine[rows] = sums.corrections(rows, cross, albedo)
+    albedo = cross
+    if sums.masked[rows].any():
+        # Where the Gram matrix leaves out clipped pixels, the products must leave out the same ones.
+        inside = kernels.cross(values, target, weight, block.start, block.inside)
+        albedo = np.where(sums.masked[rows][..., None], inside, cross)
+    state.affine[rows] = sums.corrections(rows, cross, albedo)
     # -------- errors over all pixels, clipped ones too (Eq. F.27), and selection by them (Eq. F.28) --------
     square = kernels.square(target, weight, block.start)
     state.error[rows] = sums.errors(rows, state.affine[rows], cross, square)
-    if options.variant == "full" and len(rows):
+    if len(rows):
         for p in range(3):
             state.alpha[rows, :, p] = selection_weights(state.error[rows, :, p], temperature, sums.usable[rows])
     alpha = state.alpha[rows]
@@ -158,12 +148,3 @@ def _level_spread(parts: Parts, sums: SegmentSums) -> NDArray:
     total = np.bincount(parts.of_segment, sums.weight, parts.count)
     summed = np.stack([np.bincount(parts.of_segment, sums.weight * spread[:, c], parts.count) for c in range(5)], 1)
     return summed / np.maximum(total, 1e-30)[:, None]
-
-
-def _robust_weight(block: Block, mixed: NDArray, texture: NDArray, options: FusionOptions) -> NDArray:
-    """Weight (n,) of the pixels in their cells; with `robust`, (5, n) by the distance from the texture (Eq. F.32)."""
-    if not options.robust:
-        return block.weight
-    distance = mixed - kernels.texture_at(texture, block.cell)
-    # b_r is at its floor. b_p is a common factor, which cancels in the mean of a cell.
-    return block.weight * laplace.kl_weight(distance, options.scale_floor, 1.0).astype(np.float32)

@@ -15,10 +15,9 @@ from iif_core.fusion import kernels
 from iif_core.fusion.blocks import Block, Blocks, covisibility_weight, make_block
 from iif_core.fusion.gauge import Parts, covisible_parts
 from iif_core.fusion.options import FusionOptions
-from iif_core.fusion.problem import LOWEST, NEUTRAL, Dropped, FusionProblem
+from iif_core.fusion.problem import NEUTRAL, Dropped, FusionProblem
 from iif_core.fusion.sums import CellCounts, CellSums, SegmentState, SegmentSums
 from iif_core.numerics.parallel import map_in_order
-from iif_core.reflectance.material import IDENTITY
 
 _T = TypeVar("_T")
 
@@ -51,8 +50,8 @@ class FusionPass:
 def first_pass(problem: FusionProblem, options: FusionOptions, threads: int) -> tuple[FusionPass, NDArray]:
     """Read every view: Gram matrices, counts, parts and the first texture (n_cells, 5) float32.
 
-    The texture is the cell means of the median of the predictions (Eq. F.23), or of their mean for the variants `texel_mean` and
-    `object_mean`. The pass has identity maps and equal selection weights.
+    The texture is the cell means of the median of the predictions (Eq. F.23). The pass has identity maps and equal selection
+    weights.
 
     Raises:
         InputError: shapes that do not match, ids out of range, a segment in two views.
@@ -66,7 +65,7 @@ def first_pass(problem: FusionProblem, options: FusionOptions, threads: int) -> 
 
     def start_of(view: int) -> tuple[Block, list[Dropped], NDArray]:
         block, left_out = make_block(problem, view)
-        return block, left_out, _first_values(block, options)
+        return block, left_out, _medians(block)
 
     # -------- first loop: texture, counts, edges of the graph of parts --------
     for view, (block, left_out, values) in enumerate(map_in_order(start_of, n_views, threads)):
@@ -101,11 +100,6 @@ def first_pass(problem: FusionProblem, options: FusionOptions, threads: int) -> 
     return run, cells.mean(NEUTRAL)
 
 
-def _first_values(block: Block, options: FusionOptions) -> NDArray:
-    """(5, n) median of the usable predictions of each pixel, or their mean for the variants that average."""
-    if options.variant in ("texel_mean", "object_mean"):
-        share = np.float32(block.usable / max(block.usable.sum(), 1))
-        # Identity maps, each with its share, make the mixture a mean: (s, K, CROSS), equal for all segments.
-        blend = np.broadcast_to(share[:, None] * np.float32(IDENTITY), (len(block.segments), len(share), kernels.CROSS))
-        return kernels.mixture(block.values, np.ascontiguousarray(blend), block.start, LOWEST)
+def _medians(block: Block) -> NDArray:
+    """(5, n) median of the usable predictions of each pixel."""
     return kernels.medians(block.values, block.usable, kernels.sorting_network(int(block.usable.sum())))

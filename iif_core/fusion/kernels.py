@@ -16,8 +16,6 @@ from numba import types
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from iif_core.reflectance import material
-
 # Pixels that are summed in float32 at a time, and the length of all scratch arrays.
 PIECE = 256
 _MATHS = {"reassoc", "contract", "nsz", "arcp"}  # no assumption about NaN or infinity
@@ -33,8 +31,6 @@ GRAM = 14
 CROSS = 16
 """Number of sums of `cross`: albedo 3 x 4 (row = output channel; inputs r g b 1), roughness (r, 1), metallic (m, 1).
 Affine maps are kept in the same layout."""
-IDENTITY = np.float32(material.IDENTITY)
-"""The identity map."""
 
 
 # The four functions without a body get one for each type from their `overload` when a loop is compiled.
@@ -70,11 +66,6 @@ def as_words(maps: NDArray) -> NDArray:
     if maps.dtype == np.float16:
         return np.ascontiguousarray(maps).view(np.uint16)
     return np.ascontiguousarray(maps, np.float32)
-
-
-def as_floats(values: NDArray) -> NDArray:
-    """Return words (`as_words`) as float32 numbers."""
-    return values.view(np.float16).astype(np.float32) if values.dtype == np.uint16 else values
 
 
 # ------------------------------------------------------------------------------------------------------------ blocks

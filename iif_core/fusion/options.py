@@ -33,15 +33,12 @@ class FusionOptions:
     """How the direct solver solves.
 
     Attributes:
-        variant: `full`; `uniform` = affine maps without selection, all usable predictions count alike; `texel_mean` =
-            mean of all predictions of a cell; `object_mean` = mean of all predictions of an object.
         sweeps: number of alternations.
         temperature, anneal, final_temperature: selection temperature of the first sweep in units of the segment's
             median error, factor on it per sweep, and its lower end (Eq. F.29). A final temperature above 0 averages
             predictions that are nearly as good as the best one; 0 takes the best one alone.
         ridge: strength of the ridge towards the identity map, relative to the segment's weight; it grows for segments
             of fewer than `ridge_pixels` pixels (Eq. F.26).
-        robust: cells take an M-estimate with the weight of the Laplace divergence instead of the mean.
         clip_share, clip_pixels: predicted albedo of exactly 0 or 1 is left out of the fit of the albedo map where it
             makes up at most this share of the segment and at least so many pixels remain.
         scale_floor: smallest Laplace scale.
@@ -52,13 +49,11 @@ class FusionOptions:
             predictions of the views beyond `memory`. None = these views are read again every time.
     """
 
-    variant: str = "full"
     sweeps: int = 9
     temperature: float = 1.0
     anneal: float = 0.6
     ridge: float = 0.01
     ridge_pixels: float = 30.0
-    robust: bool = False
     clip_share: float = 0.5
     clip_pixels: int = 50
     scale_floor: float = laplace.SCALE_FLOOR

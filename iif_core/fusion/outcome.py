@@ -5,24 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from iif_core.fusion import kernels
 from iif_core.fusion.fusion_pass import FusionPass
 from iif_core.fusion.problem import FusionResult, object_means
 from iif_core.fusion.scales import cell_scales
 from iif_core.fusion.selection import effective_number, margin
-from iif_core.fusion.sums import NO_MASK
 from iif_core.fusion.uncertainty import location_uncertainty
-
-
-def measure_errors(run: FusionPass, texture: NDArray) -> None:
-    """Write the mean squared error of every corrected prediction against the texture (n_cells, 5) to the state."""
-    for block in run.map_views(run.blocks):
-        rows, target = block.segments, kernels.texture_at(texture, block.cell)
-        weight = run.sums.fit_weight(block)
-        # No mask: errors count all pixels, also those that the fit of the albedo map leaves out.
-        cross = kernels.cross(block.values, target, weight, block.start, NO_MASK)
-        square = kernels.square(target, weight, block.start)
-        run.state.error[rows] = run.sums.errors(rows, run.state.affine[rows], cross, square)
 
 
 def build_result(run: FusionPass, texture: NDArray, history: list[dict[str, float]]) -> FusionResult:

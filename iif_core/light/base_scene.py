@@ -61,23 +61,13 @@ class BaseScene:
         cells[:, :3] = np.minimum(cells[:, :3] * gain[self.cell_object], 1.0)
         return replace(self, cell_values=cells, object_values=objects)
 
-    def traceable(
-        self, black: np.ndarray | None = None, extra: tuple[np.ndarray, np.ndarray] | None = None
-    ) -> tuple[Geometry, CellMaterials]:
-        """Build geometry and materials on the device, which has been chosen; faces of `black` reflect nothing, those of `extra`
-        come last, black."""
+    def traceable(self, black: np.ndarray | None = None) -> tuple[Geometry, CellMaterials]:
+        """Build geometry and materials on the device, which has been chosen; faces of `black` reflect nothing."""
         material = self.materials()
         from iif_core.light.transport.geometry import build_geometry
 
         object_id = self.object_id if black is None else np.where(black, self.n_objects, self.object_id)
-        passes = self.passes
-        if extra is None:
-            return build_geometry(self.vertices, self.faces, object_id, passes), material
-        vertices = np.concatenate([self.vertices, extra[0]])
-        faces = np.concatenate([self.faces, extra[1] + len(self.vertices)])
-        object_id = np.concatenate([object_id, np.full(len(extra[1]), self.n_objects, np.int32)])
-        passes = np.concatenate([passes, np.zeros(len(extra[1]), np.float32)])
-        return build_geometry(vertices, faces, object_id, passes), material
+        return build_geometry(self.vertices, self.faces, object_id, self.passes), material
 
     def materials(self) -> CellMaterials:
         """Build the materials on the device, which has been chosen; an object of id `n_objects` is black."""

@@ -145,9 +145,3 @@ def to_half(maps: ArrayLike) -> Halves:
     # A power of two changes the exponent alone, so the digits of a half float are kept.
     scale = np.where(top > 0, np.exp2(np.ceil(np.log2(np.where(top > 0, top, 1.0))) - np.log2(HALF_TOP)), 1.0)
     return Halves((maps / scale[:, None]).astype(np.float16), scale)
-
-
-def recombine(halves: Halves, factor: ArrayLike) -> Array:
-    """Return the light (n, 3) float64 of all lamps, each times its factor (lamps,) or (lamps, 3)."""
-    factor = np.broadcast_to(np.asarray(factor, np.float64).reshape(len(halves.scale), -1), (len(halves.scale), 3))
-    return np.einsum("nlc,lc->nc", halves.value.astype(np.float64), halves.scale[:, None] * factor)

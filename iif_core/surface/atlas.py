@@ -164,6 +164,22 @@ def texel_surface(uv: ArrayLike, faces: ArrayLike, size: int) -> tuple[NDArray, 
     return face, barycentric / np.maximum(barycentric.sum(-1, keepdims=True), np.float32(1e-12))
 
 
+def texels_around(uv: ArrayLike, faces: ArrayLike, size: int, reach: float) -> NDArray:
+    """Mark at least the texels whose centre lies within `reach` texels of a face: (S, S) bool, those around the box of each face.
+
+    Args:
+        uv, faces, size: as for `texel_surface`.
+    """
+    corners = (np.asarray(uv, np.float32) * np.float32(size))[np.asarray(faces)]
+    low = np.clip(np.floor(corners.min(1) - 0.5 - reach), 0, size).astype(np.int64)
+    high = np.clip(np.ceil(corners.max(1) - 0.5 + reach) + 1, 0, size).astype(np.int64)
+    # Sums over rows and columns of these corners count the boxes that hold each texel.
+    count = np.zeros((size + 1, size + 1), np.int64)
+    for ends, sign in (((low, low), 1), ((low, high), -1), ((high, low), -1), ((high, high), 1)):
+        np.add.at(count, (ends[0][:, 1], ends[1][:, 0]), sign)
+    return count.cumsum(0).cumsum(1)[:size, :size] > 0
+
+
 def texel_values(values: ArrayLike, faces: ArrayLike, face: NDArray, barycentric: NDArray) -> NDArray:
     """Interpolate values (n, C) of the vertices at texels: (t, C) float32, for `face` (t,) >= 0 and `barycentric` (t, 3)."""
     values = np.asarray(values, np.float32)

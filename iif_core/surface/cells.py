@@ -201,11 +201,13 @@ class CellTable:
         h = hash_words(low, high)
         step = probe_step(h)
         rows = np.full(len(low), -1, np.int32)
-        # Keys are distinct, so at most one probe matches, and the search need not end early.
+        waiting = np.arange(len(low))
         for p in range(self.probes):
-            entry = self.slots[(h + np.uint32(p) * step) & np.uint32(len(self.slots) - 1)]
-            match = (entry[:, 0] == low) & (entry[:, 1] == high) & (entry[:, 2] != EMPTY)
-            rows[match] = entry[match, 2].astype(np.int32)
+            entry = self.slots[(h[waiting] + np.uint32(p) * step[waiting]) & np.uint32(len(self.slots) - 1)]
+            full = entry[:, 2] != EMPTY
+            match = full & (entry[:, 0] == low[waiting]) & (entry[:, 1] == high[waiting])
+            rows[waiting[match]] = entry[match, 2].astype(np.int32)
+            waiting = waiting[full & ~match]  # most searches end at the first slot
         return rows
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from iif_core.errors import InputError
 from iif_core.numerics.arrays import unique_rows
 from iif_core.numerics.graph import component_labels
 
@@ -97,105 +96,6 @@ def smooth_groups(vertices: NDArray, faces: NDArray, part: NDArray, crease_cosin
     a, b = face[order][:-1][same], face[order][1:][same]
     smooth = (np.einsum("ij,ij->i", normal[a], normal[b]) > crease_cosine) & (part[a] == part[b])
     return component_labels(len(faces), a[smooth], b[smooth])
-
-
-def subdivide(vertices: NDArray, faces: NDArray, longest: float, max_faces: int) -> tuple[NDArray, NDArray, NDArray]:
-    """Halve edges until none is longer than `longest` or the next round would exceed `max_faces`.
-
-    An edge is split for all faces that share it, so no cracks appear. Every round halves the largest length allowed, so that
-    the longest edges are split first and all parts stay equally coarse when the budget is exhausted.
-
-    Args:
-        vertices, faces: welded mesh.
-        longest: length of an edge in metres, > 0.
-        max_faces: largest number of faces.
-
-    Returns:
-        vertices (n', 3) float64, faces (m', 3) int64, and the original face of every new one, (m',).
-
-    Raises:
-        InputError: `longest` is not positive.
-    """
-    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
-    parent = np.arange(len(faces))
-    if not longest > 0:
-        raise InputError(f"subdivision to edges of {longest} m: must be positive")
-    limit = np.inf  # longest edge allowed in a round
-    while True:
-        edges, edge_of = _edges(faces)
-        length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-        limit = max(longest, min(limit, length.max()) / 2)
-        marked = length > limit * (1 + 1e-9)  # an edge at the limit but for rounding is not split
-        if not marked.any():
-            if limit <= longest:
-                return vertices, faces, parent
-            continue
-        if len(faces) + np.count_nonzero(marked[edge_of]) > max_faces:  # each split edge adds one triangle to each of its faces
-            return vertices, faces, parent
-        middle = np.full(len(edges), -1, np.int64)
-        middle[marked] = len(vertices) + np.arange(np.count_nonzero(marked))
-        vertices = np.concatenate([vertices, vertices[edges[marked]].mean(1)])
-        faces, source = _split(vertices, faces, middle[edge_of])
-        parent = parent[source]
-
-
-def quarter(vertices: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
-    """Split every face at the midpoints of its edges, which neighbours share: vertices (n', 3) float64 and faces (4 m, 3) int64,
-    those of face i at 4 i ... 4 i + 3."""
-    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
-    edges, edge_of = _edges(faces)
-    split, _ = _split(vertices, faces, len(vertices) + edge_of)
-    return np.concatenate([vertices, vertices[edges].mean(1)]), split
-
-
-def _edges(faces: NDArray) -> tuple[NDArray, NDArray]:
-    """Distinct edges (e, 2) of faces (m, 3), and which of them the edges v0v1, v1v2, v2v0 of each face are, (m, 3)."""
-    edges, edge_of = unique_rows(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1))
-    return edges, edge_of.reshape(-1, 3)
-
-
-def _split(vertices: NDArray, faces: NDArray, middle: NDArray) -> tuple[NDArray, NDArray]:
-    """Split faces at the midpoints `middle` (m, 3) of their edges (v0v1, v1v2, v2v0), -1 = not split.
-
-    Returns the new faces and the face that each one came from.
-    """
-    count = (middle >= 0).sum(1)
-    out, source = [faces[count == 0]], [np.flatnonzero(count == 0)]
-
-    def add(rows: NDArray, *triangles: tuple[NDArray, NDArray, NDArray]) -> None:
-        for triangle in triangles:
-            out.append(np.stack(triangle, 1))
-            source.append(rows)
-
-    def rotated(rows: NDArray, first: NDArray) -> tuple[NDArray, NDArray]:
-        order = (first[:, None] + np.arange(3)) % 3
-        return np.take_along_axis(faces[rows], order, 1), np.take_along_axis(middle[rows], order, 1)
-
-    # -------- one split edge: two triangles that meet at the opposite corner --------
-    one = np.flatnonzero(count == 1)
-    v, e = rotated(one, np.argmax(middle[one] >= 0, 1))
-    add(one, (v[:, 0], e[:, 0], v[:, 2]), (e[:, 0], v[:, 1], v[:, 2]))
-    # -------- two split edges: the corner between them, and a quadrilateral cut along its shorter diagonal --------
-    two = np.flatnonzero(count == 2)
-    v, e = rotated(two, (np.argmin(middle[two], 1) + 1) % 3)  # the edge that is not split comes last
-    add(two, (e[:, 0], v[:, 1], e[:, 1]))
-    down = _distance(vertices, v[:, 0], e[:, 1]) < _distance(vertices, e[:, 0], v[:, 2])
-    for chosen, diagonal in ((down, True), (~down, False)):
-        a, b, c, d = v[chosen, 0], e[chosen, 0], e[chosen, 1], v[chosen, 2]
-        rows = two[chosen]
-        add(rows, *(((a, b, c), (a, c, d)) if diagonal else ((a, b, d), (b, c, d))))
-    # -------- three split edges: three corners and the triangle of the midpoints --------
-    three = np.flatnonzero(count == 3)
-    v, e = faces[three], middle[three]
-    inner = [(e[:, 0], v[:, 1], e[:, 1]), (e[:, 2], e[:, 1], v[:, 2]), (e[:, 0], e[:, 1], e[:, 2])]
-    add(three, (v[:, 0], e[:, 0], e[:, 2]), *inner)
-    source_rows = np.concatenate(source)  # children in the order of their parents
-    order = np.argsort(source_rows, kind="stable")
-    return np.concatenate(out)[order], source_rows[order]
-
-
-def _distance(vertices: NDArray, a: NDArray, b: NDArray) -> NDArray:
-    return np.linalg.norm(vertices[a] - vertices[b], axis=1)
 
 
 def _unit(v: NDArray) -> NDArray:

@@ -84,7 +84,7 @@ def main() -> None:
     from iif_core.light.emission.direct import EmissionPrior, solve_emission, solve_families
     from lab.published.light.loss import reference_loss
     from lab.published.light.sgd import SgdOptions, solve_emission_sgd
-    from tests.unit.planted_room import PlantedScene, build_room, relative_errors
+    from tests.unit.planted_room import PlantedScene, averaged, build_room, relative_errors
 
     scene = PlantedScene(build_room(arguments.room), arguments.views, arguments.size)
     photographs, lit = scene.photographs(arguments.seed, arguments.photo_samples), scene.room.truth.any(1)
@@ -100,7 +100,7 @@ def main() -> None:
             problem, initial = scene.problem(photographs, transport, kind)
             rows = problem.rows
             solvers = {
-                "plain": lambda rows=rows, initial=initial: solve_emission(rows, initial, cross=False),
+                "plain": lambda rows=rows, initial=initial: solve_emission(averaged(rows), initial),
                 "direct": lambda rows=rows, initial=initial: solve_families(
                     rows, EmissionPrior.independent(initial), scene.families()
                 ),

@@ -17,6 +17,16 @@ WHERE_FROM = (
     "Scenes from outside lie under data/ (a symbolic link is fine); the shipped ones are Benedikt Bitterli's rendering"
     " resources in Mitsuba form, with meshes/ and textures/ next to scene.xml"
 )
+XML_BYTES = 16 << 20
+"""Size of a Mitsuba XML file, at most. The largest scene in use has 0.6 MB."""
+XML_ELEMENTS = 200_000
+"""Elements of the XML files of a scene, at most."""
+XML_FILES = 256
+"""XML files of a scene, at most."""
+XML_DEFAULTS = 1_000
+"""`<default>` values of a scene, at most."""
+XML_DEPTH = 64
+"""Levels of elements in a Mitsuba XML file, at most."""
 _SHOWN = 8
 _DEEPEST = 16  # <include> levels
 
@@ -63,10 +73,8 @@ class _Search:
     def collect(self, xml: Path, folders: list[Path], defaults: dict[str, str], depth: int) -> None:
         """Add what one XML file names, and what the files name that it includes."""
         self.documents += 1
-        if self.documents > limits.XML_FILES:
-            raise InputError(
-                f"{xml}: more than {limits.XML_FILES} XML files with all that are included; does a file include itself?"
-            )
+        if self.documents > XML_FILES:
+            raise InputError(f"{xml}: more than {XML_FILES} XML files with all that are included; does a file include itself?")
         root = _root(xml)
         if depth == 0 and root.tag != "scene":
             raise InputError(f"{xml}: the outermost element is <{root.tag:.40}>, expected <scene version='3.0.0'>")
@@ -74,10 +82,9 @@ class _Search:
         folders = list(folders)
         for element in root.iter():
             self.elements += 1
-            if self.elements > limits.XML_ELEMENTS or len(defaults) > limits.XML_DEFAULTS:
+            if self.elements > XML_ELEMENTS or len(defaults) > XML_DEFAULTS:
                 raise InputError(
-                    f"{xml}: more than {limits.XML_ELEMENTS} elements, or {limits.XML_DEFAULTS} <default> values, with what is"
-                    " included"
+                    f"{xml}: more than {XML_ELEMENTS} elements, or {XML_DEFAULTS} <default> values, with what is included"
                 )
             self.tags.add(element.tag)
             if element.tag == "default":
@@ -105,14 +112,14 @@ class _Search:
 
 def _root(xml: Path) -> ET.Element:
     """Return the outermost element of an XML file, after checking how deep its elements are nested."""
-    check_file(xml, limits.XML_BYTES, "a Mitsuba scene")
+    check_file(xml, XML_BYTES, "a Mitsuba scene")
     depth, root = 0, None
     try:
         for event, element in ET.iterparse(xml, ("start", "end")):
             root = element if root is None else root
             depth += 1 if event == "start" else -1
-            if depth > limits.XML_DEPTH:
-                raise InputError(f"{xml}: elements are nested more than {limits.XML_DEPTH} levels deep")
+            if depth > XML_DEPTH:
+                raise InputError(f"{xml}: elements are nested more than {XML_DEPTH} levels deep")
     except ET.ParseError as error:
         line, column = error.position
         raise InputError(

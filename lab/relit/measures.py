@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
-from iif_core.evaluation.catalogue import RELIT_PROTOCOLS
+from iif_core.evaluation.catalogue import ProtocolName
 from iif_core.evaluation.lpips import Weights
 from iif_core.evaluation.metrics import Score, Target
 from iif_core.numerics.color import tone_map
@@ -21,6 +21,7 @@ Array = np.ndarray
 
 WHITE, SHARE = 0.8, 0.95
 """The exposure brings this quantile of the largest channel of the true pictures to this level."""
+RELIT_PROTOCOLS: tuple[ProtocolName, ...] = ("raw", "gain", "scaled")
 METRICS = ("l2", "psnr", "ssim", "flip", "lpips", "lpips_vgg")
 
 

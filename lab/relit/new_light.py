@@ -121,13 +121,21 @@ def relit_world(scene: Recovered, light: NewLight, lamp_of_face: np.ndarray) -> 
         radiance, side, own = radiance[~own], side[~own], own[~own]
     elif extra is not None:
         extra_side = np.ones(len(extra[1]), np.int8)
+    from iif_core.light.transport.geometry import build_geometry
     from iif_core.light.transport.scene import Scene
 
     device.mitsuba()
     if extra is None:
         geometry, material = surface.traceable(own)
         return Scene(geometry, material, Light(radiance, side, own, environment).emitters(geometry))
-    geometry, material = surface.traceable(own, extra[:2])
+    material = surface.materials()
+    black, solid = np.full(len(extra[1]), surface.n_objects, np.int32), np.zeros(len(extra[1]), np.float32)
+    geometry = build_geometry(
+        np.concatenate([surface.vertices, extra[0]]),
+        np.concatenate([surface.faces, extra[1] + len(surface.vertices)]),
+        np.concatenate([np.where(own, surface.n_objects, surface.object_id), black]),
+        np.concatenate([surface.passes, solid]),
+    )
     shining = Light(
         np.concatenate([radiance, extra[2]]),
         np.concatenate([side, extra_side]),

@@ -9,9 +9,8 @@ import numpy as np
 
 from iif_core.camera.pinhole import look_at
 from iif_core.errors import InputError
-from iif_core.surface.triangles import quarter
 from lab.rooms.patterns import Material, MaterialTable
-from lab.rooms.shapes import Shape, merge
+from lab.rooms.shapes import Shape, merge, quarter
 
 EMITTER_MATERIAL = Material((0.0, 0.0, 0.0), roughness=(1.0, 0.0, 0.0))
 CAMERA_MARGIN = 0.10  # metres between a camera and the box around any piece of furniture

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from iif_core.numerics.arrays import unique_rows
+
 Shape = tuple[np.ndarray, np.ndarray]
 Point = Sequence[float]
 
@@ -290,3 +292,15 @@ def ring(centre: Point, radius: float, thickness: float, axis_u: Point, axis_v: 
     a, b = i * 10 + j, (i + 1) % segments * 10 + j
     c, d = (i + 1) % segments * 10 + (j + 1) % 10, i * 10 + (j + 1) % 10
     return vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
+def quarter(vertices: np.ndarray, faces: np.ndarray) -> Shape:
+    """Split every face at the midpoints of its edges, which neighbours share: vertices (n', 3) float64 and faces (4 m, 3) int64,
+    those of face i at 4 i ... 4 i + 3."""
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+    edges, edge_of = unique_rows(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1))
+    a, b, c = faces.T
+    ab, bc, ca = len(vertices) + edge_of.reshape(-1, 3).T
+    corners = (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
+    split = np.stack([np.stack(triangle, 1) for triangle in corners], 1)
+    return np.concatenate([vertices, vertices[edges].mean(1)]), split.reshape(-1, 3)

@@ -55,8 +55,6 @@ class Base(base.Base):
     """Weight of pixels next to another object."""
     footprint_power: float = Field(CellOptions.footprint_power, ge=0, le=4)
     """Weight pixels by (median footprint / own footprint) to this power."""
-    robust: bool = FusionOptions.robust
-    """Cells take an M-estimate instead of the mean."""
     sweeps: int = Field(FusionOptions.sweeps, ge=1, le=200)
     """Alternations."""
     ridge: float = Field(FusionOptions.ridge, gt=0)

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from workflow.models.denoise import NOTE, denoise, require_denoiser
-from workflow.scene.normal_form import CaptureWriter, Truth, View
+from lab.sources.rendered import DENOISED, RenderedWriter
+from workflow.models.denoise import denoise, require_denoiser
+from workflow.scene.normal_form import Truth, View
 
 if TYPE_CHECKING:
     from lab.rooms.room import Room
@@ -53,7 +54,7 @@ class _Capture:
         from iif_core.light.transport.geometry import build_geometry
 
         self.job, self.settings, self.room = job, job.settings.capture, room
-        self.writer = CaptureWriter(job.writer)
+        self.writer = RenderedWriter(job.writer)
         self.geometry = build_geometry(room.vertices, room.faces, room.object_id)
         front = np.ones(len(room.faces), np.int8)
         outside = {} if room.environment is None else {"environment": room.environment}
@@ -168,7 +169,7 @@ class _Capture:
         if self.response is not None:
             notes.append(f"8-bit photographs through the response `{self.response.name}`; exposures differ")
         if self.settings.denoise:
-            notes.append(NOTE)
+            notes.append(DENOISED)
         coverage = {"seen_once": round(once, 4), "seen_twice": round(twice, 4), "points": COVERAGE_POINTS}
         facts = {"room": self.room.name, "coverage": coverage}
         samples = None if self.response is None else self.response.samples()

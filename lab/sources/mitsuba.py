@@ -16,10 +16,11 @@ import numpy as np
 
 from iif_core.errors import InputError
 from lab.mitsuba_scene.document import referenced_files
+from lab.sources.rendered import DENOISED, RenderedWriter
 from workflow.intake.meshes import check_mesh
 from workflow.intake.pictures import check_texture
-from workflow.models.denoise import NOTE, denoise, require_denoiser
-from workflow.scene.normal_form import CaptureWriter, Truth, View
+from workflow.models.denoise import denoise, require_denoiser
+from workflow.scene.normal_form import Truth, View
 
 if TYPE_CHECKING:
     from workflow.runtime.job import Job
@@ -68,7 +69,7 @@ class _Capture:
 
     def __init__(self, job: Job):
         self.job, self.settings, self.source = job, job.settings.capture, job.settings.source
-        self.writer = CaptureWriter(job.writer)
+        self.writer = RenderedWriter(job.writer)
 
     def run(self) -> None:
         import mitsuba as mi
@@ -316,7 +317,7 @@ class _Capture:
         if self.dropped:
             self.notes.append(f"{self.dropped} path samples were not finite and are left out of the photographs")
         if self.settings.denoise:
-            self.notes.append(NOTE)
+            self.notes.append(DENOISED)
         samples = None if self.response is None else self.response.samples()
         self.writer.finish("mitsuba", self.settings.dynamic_range, True, self.notes, samples, self.facts)
         for note in self.notes:

@@ -16,6 +16,7 @@ from iif_core.fusion.selection import selection_weights
 from iif_core.light import environment
 from iif_core.numerics import color, frames, laplace, normal_tail, xp
 from iif_core.reflectance import brdf
+from lab.published.fusion import divergence
 from lab.stability.scalar import Argument, Form, Kernel
 from workflow.runtime import device
 
@@ -217,9 +218,9 @@ def _selection(temperature: float) -> Kernel:
 
 FUSION = [
     Kernel("Laplace divergence", _kl, ("KL",), {"d": DISTANCE, "b_ref": SCALE, "b_pred": SCALE},
-           of_numpy(laplace.kl, np.float32, np.float64), _equal_scales),
+           of_numpy(divergence.kl, np.float32, np.float64), _equal_scales),
     Kernel("weight of the divergence", _kl_weight, ("w",), {"d": DISTANCE, "b_ref": SCALE, "b_pred": SCALE},
-           of_numpy(laplace.kl_weight, np.float32, np.float64)),
+           of_numpy(divergence.kl_weight, np.float32, np.float64)),
     Kernel("contribution to a scale", _contribution, ("E|x|",), {"d": DISTANCE, "b_ref": SCALE},
            of_numpy(laplace.scale_contribution, np.float32, np.float64)),
     *(_selection(temperature) for temperature in (1e-12, 0.05, 1.0, 1e6)),

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iif_core.surface.triangles import quarter
+from lab.rooms.shapes import quarter
 from lab.stability import chain
 from lab.stability.chain import Capture, Result
 from workflow.scene.normal_form import View

@@ -425,7 +425,7 @@ def calibration() -> Iterator[Solved]:
 
 def registration() -> Iterator[Solved]:
     """The first step of the registration: six cameras above a painted floor, whose paint decides what is known of them."""
-    from iif_core.camera.registration import first_step, register
+    from iif_core.camera.registration import register
 
     def waves(x: NDArray, y: NDArray) -> NDArray:
         return np.exp(0.5 * np.sin(9 * x + 1) * np.sin(7 * y) + 0.3 * np.sin(23 * x - 17 * y))
@@ -444,7 +444,7 @@ def registration() -> Iterator[Solved]:
     }
     for name, (paint, views, light, metres) in cases.items():
         photos = [_floor_photo(paint, turn, light, metres) for turn in np.linspace(0, 2 * np.pi, views, endpoint=False)]
-        normal, right, step = first_step(photos, 4000)
+        normal, right, step = _first_step(photos, 4000)
         forward = relative_error(step, exact_solution(normal, right)) if len(right) < 50 else math.nan
         found = register(photos, 1000) if views == 6 and metres == light == 1.0 else None
         lost = _lost(step) + (_lost(found.pose, found.principal) if found else 0)
@@ -452,6 +452,17 @@ def registration() -> Iterator[Solved]:
         yield Solved(
             "registration", name, len(step), condition_of(normal), backward_error(normal, step, right), forward, lost, says
         )
+
+
+def _first_step(photos: list[Photo], points: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Return the normal equations of the first step of `register`, (6 V + 3, 6 V + 3) and (6 V + 3,), and its solution."""
+    from iif_core.camera import registration as of
+
+    features = [of.feature_image(p.image, p.usable) for p in photos]
+    maps, start = [of._Maps.of(f, of.BLURS[0]) for f in features], of._Cameras.of(photos)
+    edges = [of._edge_points(p) for p in photos]
+    normal, right = of.normal_equations(photos, maps, start, of._overlap(photos, features, points), edges)
+    return normal, right, np.linalg.solve(normal, right)
 
 
 def _floor_photo(paint: Callable[[NDArray, NDArray], NDArray], turn: float, light: float, metres: float) -> Photo:

@@ -23,7 +23,9 @@ MORRIS_LEVELS = 4
 """Levels of each factor of a screening."""
 METRICS = tuple(name for name in catalogue.METRICS if name != "psnr_3d")
 """Metrics that a study can show."""
-QUANTITIES = (*catalogue.PROTOCOLS_OF, "rgb_held_out", *catalogue.RELIT)
+RELIT = ("relit_lamp", "relit_moved", "relit_environment", "relit_sphere")
+"""Pictures under new light: a lamp alone, a moved lamp, an environment, a glowing sphere."""
+QUANTITIES = (*catalogue.PROTOCOLS_OF, "rgb_held_out", *RELIT)
 
 
 class Variant(of_settings.Variant):

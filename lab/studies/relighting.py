@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from iif_core.errors import InputError
-from iif_core.evaluation.catalogue import METRICS, RELIT, RELIT_PROTOCOLS
+from iif_core.evaluation.catalogue import METRICS
+from lab.relit.measures import RELIT_PROTOCOLS
 from lab.studies import table
-from lab.studies.files import load_study
+from lab.studies.files import RELIT, load_study
 from lab.studies.grid import LIGHTS, sheet, write_grid
 from workflow.artifacts.files import write_atomically
 from workflow.report.blocks import fill, markdown

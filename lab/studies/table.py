@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from iif_core.errors import InputError
-from iif_core.evaluation.catalogue import METRICS, PROTOCOLS, PROTOCOLS_OF, RELIT
+from iif_core.evaluation.catalogue import METRICS, PROTOCOLS, PROTOCOLS_OF
 from lab.costs.records import disk_mb
-from lab.studies.files import Paper, Study, load_study
+from lab.studies.files import RELIT, Paper, Study, load_study
 from lab.studies.growth import growth_lines
 from lab.studies.regret import judge, regret_lines
 from lab.studies.variants import FOLDER

@@ -27,7 +27,7 @@ VARIANTS = {
     "object_mean": "{variant: object_mean}",
     "raw": "{variant: raw}",
     "two predictions": "{predictions: 2}",
-    "robust, by footprint": "{robust: true, footprint_power: 1, border_weight: 1, seams: false}",
+    "by footprint": "{footprint_power: 1, border_weight: 1, seams: false}",
     "sgd on cells": "{solver: sgd, iterations: 30, judge: true, polish: 5}",
     "sgd on a hash grid": "{solver: sgd, texture: hashgrid, iterations: 10, hash_levels: 4, hash_entries: 12}",
     "sgd as published": "{solver: sgd, preset: paper, iterations: 5, hash_levels: 4, hash_entries: 12}",

@@ -125,8 +125,6 @@ def test_a_selection_that_does_not_fit_is_refused():
     problem, _ = simulated()
     with pytest.raises(InputError, match="chosen predictions"):
         solve_distribution(problem, chosen=np.zeros((2, 3), int))
-    with pytest.raises(InputError, match="variant: texel_mean"):
-        solve_distribution(problem, FusionOptions("texel_mean"))
 
 
 def test_described_fit_is_the_fit():

@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from iif_core.fusion.direct import solve_direct
-from iif_core.fusion.kernels import IDENTITY, as_words
-from iif_core.fusion.options import FusionOptions
+from iif_core.fusion.kernels import as_words
 from iif_core.fusion.problem import LOWEST, NEUTRAL, FusionProblem
-from iif_core.reflectance.material import unclamped_material
+from iif_core.reflectance.material import IDENTITY, unclamped_material
 from lab.published.fusion.hashgrid.levels import HashGridOptions
 from lab.published.fusion.reference_loss import loss_of_result
 from lab.published.fusion.sgd import engine, kernels, solve
 from lab.published.fusion.sgd import pool as sgd_pool
 from lab.published.fusion.sgd.options import SgdOptions, sgd_options
 from lab.published.fusion.sgd.solve import SgdState, converged, solve_sgd
+from lab.published.fusion.variants import solve_variant
 from tests.errors import refused
 from tests.oracles import torch_sgd
 from tests.oracles.label_loss import label_loss
@@ -34,7 +34,7 @@ SMALL_GRID = HashGridOptions(levels=6, log2_entries=12, base_resolution=8, growt
 def state(k, seed=0, n=150, segments=4, spread=0.15, low=0.0):
     """Parameters and a batch sorted by segment, float64."""
     rng = np.random.default_rng(seed)
-    affine = np.tile(IDENTITY.astype(np.float64), (segments, k, 1)) + spread * rng.standard_normal((segments, k, 16))
+    affine = np.tile(IDENTITY, (segments, k, 1)) + spread * rng.standard_normal((segments, k, 16))
     usable = np.ones((segments, k), bool)
     if k > 2:
         usable[1, 0] = usable[1, 2] = False
@@ -289,7 +289,7 @@ def test_loss_falls_in_the_history():
     assert found.total == pytest.approx(after["total"], rel=0.02)
     regulariser = found.regulariser_albedo + found.regulariser_roughness + found.regulariser_metallic
     assert regulariser == pytest.approx(after["regulariser"], rel=0.02)
-    mean = solve_direct(problem, FusionOptions("texel_mean"))
+    mean = solve_variant(problem, "texel_mean")
     assert oracle_psnr(problem, fit.value, truth) > oracle_psnr(problem, mean.value, truth) + 0.3
     assert fit.value.shape == fit.scale.shape == (problem.n_cells, 5) and fit.scale.min() >= 0.01
     assert (fit.value >= LOWEST).all() and (fit.value <= 1).all()

@@ -3,6 +3,7 @@
 import numpy as np
 
 from iif_core.evaluation import metrics
+from iif_core.evaluation.flip import Seen, difference
 
 
 def l2(prediction, truth, mask):
@@ -36,3 +37,11 @@ def oracle_affine(prediction, truth, mask, object_id, ridge=1e-6):
     if mask.any():
         x[mask] = metrics._Groups(object_id[mask], y[mask]).nearest(x[mask], ridge)
     return x.reshape(np.shape(prediction))
+
+
+def flip(prediction, truth, mask, encoded=False):
+    """LDR-FLIP, the mean over the masked pixels (Eq. E.6); `encoded`: the images are sRGB-encoded instead of linear."""
+    truth = np.where(np.isfinite(truth), truth, 0)
+    filled = np.where(mask[..., None], prediction, truth)
+    images = (Seen(np.clip(image, 0, 1), encoded) for image in (filled, truth))
+    return float(difference(*images)[mask].mean(dtype=np.float64))

@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from iif_core.fusion.kernels import IDENTITY
 from iif_core.fusion.problem import LOWEST
 from lab.published.fusion.sgd.kernels import LOCATION, SCALE
 from lab.published.fusion.sgd.options import SgdOptions
-from lab.published.fusion.sgd.pool import TERMS, Pool, Step, softmax, start_values
+from lab.published.fusion.sgd.pool import IDENTITY, TERMS, Pool, Step, softmax, start_values
 
 _PROPERTY_OF_CHANNEL = [0, 0, 0, 1, 2]
 

@@ -3,7 +3,7 @@ triangles, a lamp, and 3 surfaces that are taken for emitters and are none."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from iif_core.camera.pinhole import look_at, pixel_directions
 from iif_core.camera.response import response
 from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import EmissionProblem, assemble, initial_radiance
-from iif_core.light.emission.rows import TracedTransport
+from iif_core.light.emission.rows import EmissionRows, TracedTransport
 from iif_core.light.emission.sensor import Sensor
 
 SIZE = np.array([5.0, 4.0, 2.7])
@@ -190,6 +190,12 @@ class PlantedScene:
         """(G,) object of every group."""
         first = np.unique(self.room.group, return_index=True)
         return self.room.object_id[first[1][first[0] >= 0]]
+
+
+def averaged(rows: EmissionRows) -> EmissionRows:
+    """The rows with the mean of the two traces in the place of each, whose noise then attenuates the answer (Eq. L.21)."""
+    matrix, cached = (np.repeat(trace.mean(0, keepdims=True), 2, 0) for trace in (rows.matrix, rows.cached))
+    return replace(rows, matrix=matrix, cached=cached)
 
 
 def relative_errors(room: Room, radiance: np.ndarray) -> np.ndarray:

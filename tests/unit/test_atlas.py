@@ -11,6 +11,7 @@ from iif_core.surface.atlas import (
     texel_density,
     texel_surface,
     texel_values,
+    texels_around,
     unwrap,
 )
 from iif_core.surface.closest import closest_points
@@ -94,6 +95,21 @@ def test_nothing_to_show():
     face, barycentric = texel_surface(np.zeros((0, 2)), np.zeros((0, 3), int), 16)
     assert (face == -1).all() and not barycentric.any()
     np.testing.assert_array_equal(nearest_covered(np.zeros((3, 3), bool)).ravel(), np.arange(9))
+
+
+def test_no_texel_near_a_face_is_left_out():
+    """Against the distance of every texel; and texels far from all faces are left out."""
+    rng = np.random.default_rng(5)
+    uv = (rng.random((12, 1, 2)) + rng.uniform(-0.04, 0.04, (12, 3, 2))).reshape(-1, 2)  # some reach over the border
+    faces = np.arange(36).reshape(-1, 3)
+    size, reach = 96, 1.5
+    around = texels_around(uv, faces, size, reach)
+    row, column = np.divmod(np.arange(size * size), size)
+    centre = np.stack([column + 0.5, row + 0.5, np.zeros(size * size)], 1)
+    near = closest_points(np.pad(uv * size, ((0, 0), (0, 1))), faces, centre)
+    distance = np.linalg.norm(near.points - centre, axis=1).reshape(size, size)
+    assert around[distance <= reach].all() and not around[distance > 12].any() and 0.02 < around.mean() < 0.4
+    assert not texels_around(uv, faces[:0], size, reach).any()
 
 
 def test_background_takes_the_nearest_texel():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
-from iif_core.light.emission.cache import RadianceSums, VoxelPixels
+from iif_core.light.emission.cache import VoxelPixels
 from iif_core.light.emission.candidates import (
     FaceStatistics,
     emitter_candidates,
@@ -13,6 +13,7 @@ from iif_core.light.emission.candidates import (
     radiance_threshold,
 )
 from iif_core.light.emission.groups import GroupingOptions, group_emitters
+from iif_core.surface.cells import pack_keys
 from iif_core.surface.segments import face_adjacency
 from iif_core.surface.triangles import face_geometry
 
@@ -293,10 +294,9 @@ def test_radiance_threshold_ignores_emitters_and_finds_them():
     np.testing.assert_allclose(radiance_threshold(_statistics([5, 5], [7, 7])) / 7, 5)
 
 
-def _same_cache(found, expected):
-    """To the last bit."""
-    for name in ("edge", "origin", "ijk", "radiance", "samples", "censored"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+def cache_of(points, radiance, censored, edge=1.0, origin=(0, 0, 0)):
+    """The cache of all pixels."""
+    return VoxelPixels.of(edge, np.array(origin, np.float32), points, radiance, censored).cache(np.ones(len(points), bool))
 
 
 def test_radiance_voxels_against_a_dictionary():
@@ -304,56 +304,41 @@ def test_radiance_voxels_against_a_dictionary():
     points, value = rng.uniform(-1, 1, (3000, 3)).astype(np.float32), rng.random((3000, 3))
     censored = rng.random(3000) < 0.3
     origin = np.array([-1.3, -1.1, -1.2], np.float32)
-    sums = RadianceSums(0.25, origin)
-    for part in np.array_split(np.arange(3000), 7):
-        sums.add(points[part], value[part], censored[part])
-    out = sums.finish()
     at_once = VoxelPixels.of(0.25, origin, points, value, censored)
-    _same_cache(at_once.cache(np.ones(3000, bool)), out)
-    half = rng.random(3000) < 0.5
-    some = RadianceSums(0.25, origin)
-    some.add(points[half], value[half], censored[half])
-    _same_cache(at_once.cache(half), some.finish())
-    expected: dict = {}
-    for p, v, c in zip(points, value, censored, strict=True):
-        expected.setdefault(tuple(np.floor((p - origin) / np.float32(0.25)).astype(int)), []).append((v, c))
-    assert len(out.ijk) == len(expected) == len(np.unique(out.ijk, axis=0))
-    for key, radiance, samples, bound in zip(out.ijk, out.radiance, out.samples, out.censored, strict=True):
-        rows = expected[tuple(key)]
-        clear = [v for v, c in rows if not c]
-        want = np.mean(clear, 0) if clear else np.max([v for v, _ in rows], 0)
-        np.testing.assert_allclose(radiance, want, rtol=1e-5)
-        assert bound == (not clear) and samples == len(clear or rows)
+    for use in (np.ones(3000, bool), rng.random(3000) < 0.5, rng.random(3000) < 0.01):
+        out = at_once.cache(use)
+        expected: dict = {}
+        for p, v, c in zip(points[use], value[use], censored[use], strict=True):
+            expected.setdefault(tuple(np.floor((p - origin) / np.float32(0.25)).astype(int)), []).append((v, c))
+        assert out.edge == 0.25 and (out.origin == origin).all()
+        assert len(out.ijk) == len(expected) == len(np.unique(out.ijk, axis=0))
+        assert (np.diff(pack_keys(out.ijk).astype(np.int64)) > 0).all()
+        for key, radiance, samples, bound in zip(out.ijk, out.radiance, out.samples, out.censored, strict=True):
+            rows = expected[tuple(key)]
+            clear = [v for v, c in rows if not c]
+            want = np.mean(clear, 0) if clear else np.max([v for v, _ in rows], 0)
+            np.testing.assert_allclose(radiance, want, rtol=1e-5)
+            assert bound == (not clear) and samples == len(clear or rows)
 
 
 def test_radiance_voxels_extremes():
-    empty = RadianceSums(0.1, np.zeros(3)).finish()
-    _same_cache(
-        VoxelPixels.of(0.1, np.zeros(3), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool)).cache(np.zeros(0, bool)), empty
-    )
+    empty = cache_of(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
     assert empty.ijk.shape == (0, 3) and empty.radiance.shape == (0, 3)
-    sums = RadianceSums(0.1, np.zeros(3))
-    sums.add(np.full((2, 3), 0.05), np.array([[np.nan, 0, 0], [0.0, 0.0, 0.0]]), np.zeros(2, bool))
-    black = sums.finish()
+    black = cache_of(np.full((1, 3), 0.05), np.zeros((1, 3)), np.zeros(1, bool))
     assert len(black.ijk) == 1 and black.samples[0] == 1 and (black.radiance == 0).all()  # black, but known
-    for point in (1e6, -5.0):
+    for point, edge in ((1e6, 0.1), (-5.0, 0.1), (0.0, 0.0)):
         with pytest.raises(InputError):
-            sums.add(np.full((1, 3), point), np.ones((1, 3)), np.zeros(1, bool))
-    with pytest.raises(InputError):
-        RadianceSums(0.0, np.zeros(3)).add(np.zeros((1, 3)), np.ones((1, 3)), np.zeros(1, bool))
+            cache_of(np.full((1, 3), point), np.ones((1, 3)), np.zeros(1, bool), edge)
 
 
 def test_bounds_of_the_cache_are_raised_and_nothing_else():
-    sums = RadianceSums(1.0, np.zeros(3))
     points = np.array([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5], [2.5, 0.5, 0.5]])
-    sums.add(points, np.full((3, 3), 2.0), np.array([True, True, False]))
-    cache = sums.finish()
+    cache = cache_of(points, np.full((3, 3), 2.0), np.array([True, True, False]))
     at = np.concatenate([points[[0, 0, 2]], [[9.5, 0.5, 0.5]]])
     out = cache.raised(at, np.array([[3.0, 1.0, 8.0], [5.0, 2.0, 8.0], [7.0] * 3, [7.0] * 3]))
     order = np.argsort(out.ijk[:, 0])
     assert out.radiance[order].tolist() == [[4.0, 2.0, 8.0], [2.0] * 3, [2.0] * 3]
     assert out.censored.tolist() == cache.censored.tolist() and (cache.radiance == 2).all()
     assert cache.raised(np.zeros((0, 3)), np.zeros((0, 3))).radiance.tolist() == cache.radiance.tolist()
-    known = RadianceSums(1.0, np.zeros(3))
-    known.add(points, np.ones((3, 3)), np.zeros(3, bool))
-    assert known.finish().raised(points, np.full((3, 3), 9.0)).radiance.max() == 1
+    known = cache_of(points, np.ones((3, 3)), np.zeros(3, bool))
+    assert known.raised(points, np.full((3, 3), 9.0)).radiance.max() == 1

@@ -45,10 +45,9 @@ def _random(n=500, groups=3, seed=0):
 
 def test_planted_emission_is_recovered():
     a, y = _random()
-    for cross in (True, False):
-        out = solve_emission(_rows(a, a, y), np.ones((3, 3)), cross=cross, ridge=1e-12)
-        np.testing.assert_allclose(out.radiance, TRUE, rtol=1e-6)
-        assert out.residual < 1e-6 and out.converged and (out.determined > 0.999).all()
+    out = solve_emission(_rows(a, a, y), np.ones((3, 3)), ridge=1e-12)
+    np.testing.assert_allclose(out.radiance, TRUE, rtol=1e-6)
+    assert out.residual < 1e-6 and out.converged and (out.determined > 0.999).all()
 
 
 def test_noise_in_a_attenuates_and_two_estimates_cure_it():
@@ -56,8 +55,8 @@ def test_noise_in_a_attenuates_and_two_estimates_cure_it():
     rng = np.random.default_rng(1)
     a, y = _random(200_000, seed=2)
     a1, a2 = (a * (1 + 0.5 * rng.standard_normal(a.shape)) for _ in range(2))
-    single = solve_emission(_rows(a1, a1, y), np.ones((3, 3)), cross=False, ridge=1e-9)
-    both = solve_emission(_rows(a1, a2, y), np.ones((3, 3)), cross=True, ridge=1e-9)
+    single = solve_emission(_rows(a1, a1, y), np.ones((3, 3)), ridge=1e-9)
+    both = solve_emission(_rows(a1, a2, y), np.ones((3, 3)), ridge=1e-9)
     # E[A'A] = J/4 + I/12 for uniform A; the noise adds I/12 on the diagonal: x = (J/4 + I/6)^-1 (J/4 + I/12) (5,
     # 10, 20).
     np.testing.assert_allclose(single.radiance[:, 0], [7.27, 9.77, 14.77], atol=0.15)
@@ -69,7 +68,7 @@ def test_against_bounded_least_squares():
     rng = np.random.default_rng(3)
     a = rng.random((80, 6, 3)).astype(np.float32)
     y, w = rng.normal(1, 2, (80, 3)), rng.uniform(0.2, 3, (80, 3))
-    out = solve_emission(_rows(a, a, y, w), np.zeros((6, 3)), cross=False, ridge=1e-13)
+    out = solve_emission(_rows(a, a, y, w), np.zeros((6, 3)), ridge=1e-13)
     for c in range(3):
         s = np.sqrt(w[:, c])
         oracle = lsq_linear(a[:, :, c] * s[:, None], y[:, c] * s, (0, np.inf), tol=1e-14).x
@@ -179,7 +178,7 @@ def test_blocks_cut_the_attenuation():
     noisy = a * (1 + rng.standard_normal(a.shape))
     pixel = _rows(noisy, noisy, y)
     blocks, _ = block_rows(pixel, np.repeat(np.arange(400), 64))
-    error = [np.abs(solve_emission(r, np.ones((3, 3)), cross=False).radiance - TRUE).max() for r in (pixel, blocks)]
+    error = [np.abs(solve_emission(r, np.ones((3, 3))).radiance - TRUE).max() for r in (pixel, blocks)]
     assert error[1] < 0.1 * error[0]
 
 

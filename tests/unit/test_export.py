@@ -24,12 +24,14 @@ from iif_core.surface.atlas import nearest_covered, texel_values, unwrap
 from iif_core.surface.cells import voxel_indices
 from iif_core.surface.lookup import values_at
 from iif_core.surface.tangents import vertex_tangents
-from iif_core.surface.triangles import face_geometry, subdivide, vertex_normals
+from iif_core.surface.triangles import face_geometry, vertex_normals
+from lab.rooms.shapes import quarter
 from tests.browser import missing
 from tests.errors import named, refused
 from tests.oracles import gltf_viewer
 from tests.oracles.blender import read_by_blender, require_bpy
 from tests.oracles.exported import maps_of, read_back
+from tests.oracles.mitsuba_lobes import metal_reflectance
 from workflow.exporters.atlas import (
     Atlas,
     TexturedPart,
@@ -43,6 +45,7 @@ from workflow.exporters.atlas import (
 )
 from workflow.exporters.camera_files import cameras_json
 from workflow.exporters.glb import fitting_glb, glb_bytes, rotation_to_y
+from workflow.exporters.mitsuba_lobes import METAL
 from workflow.exporters.mitsuba_scene import mitsuba_files
 from workflow.exporters.normal_map import normal_picture
 from workflow.exporters.surface import SeenSurface, build_parts, seen_sides, up_axis
@@ -249,7 +252,12 @@ def test_charts_narrower_than_a_texel_have_their_own_colour():
 def test_a_mesh_that_is_too_fine_becomes_simpler_and_keeps_its_colours():
     """The room in small triangles: the flat walls give them up, the lamp keeps its own, and colours stay where they were."""
     scene = room()
-    vertices, faces, parent = subdivide(scene.surface.vertices, scene.surface.faces, 0.06, 10**6)
+    lamp = scene.surface.object_id == 2  # its faces stay as they are
+    vertices, fine = scene.surface.vertices, scene.surface.faces[~lamp]
+    while len(fine) <= 20000:
+        vertices, fine = quarter(vertices, fine)
+    faces = np.concatenate([scene.surface.faces[lamp], fine])
+    parent = np.r_[np.flatnonzero(lamp), np.repeat(np.flatnonzero(~lamp), len(fine) // (~lamp).sum())]
     surface = replace(
         scene.surface,
         vertices=vertices.astype(np.float32),
@@ -260,7 +268,7 @@ def test_a_mesh_that_is_too_fine_becomes_simpler_and_keeps_its_colours():
     light = Light(own.radiance[parent], own.side[parent], own.emits[parent], own.environment)
     fine = replace(scene, surface=surface, light=light, emitter_id=scene.emitter_id[parent])
     parts = parts_of(fine, max_faces=2000)
-    assert len(faces) > 20000 and sum(len(p.faces) for p in parts.values()) < 2500
+    assert sum(len(p.faces) for p in parts.values()) < 2500
     assert len(parts["lamp.emitter0"].faces) == (surface.object_id == 2).sum() and not parts["lamp.emitter0"].simplified
     walls = parts["walls"]
     assert walls.simplified
@@ -764,6 +772,10 @@ def own_render(scene, camera, samples):
     world = Scene(geometry, material, scene.light.emitters(geometry))
     image = render(world, pose[:3, 3], rays.reshape(-1, 3), PathOptions(samples, 8, 1), jitter)
     return image.reshape(camera.height, camera.width, 3)
+
+
+def test_the_table_of_mitsubas_metal_is_what_the_plug_in_gives(mi):
+    np.testing.assert_allclose(METAL, metal_reflectance(), rtol=1e-5)
 
 
 def test_mitsuba_renders_what_we_render(mi, tmp_path, monkeypatch):

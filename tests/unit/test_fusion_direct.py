@@ -17,6 +17,7 @@ from iif_core.fusion.problem import LOWEST, NEUTRAL, FusionProblem, object_means
 from iif_core.fusion.selection import selection_weights
 from iif_core.numerics import laplace
 from iif_core.surface.segments import interior, segment_table
+from lab.published.fusion.variants import solve_variant
 from lab.simulated import errors as simulate
 from tests.errors import refused
 from tests.oracles import scores as single
@@ -110,8 +111,7 @@ def seen(problem):
 def test_selection_beats_corrections_beat_means(seed):
     problem, truth = simulated(seed=seed)
     psnr = {
-        v: oracle_psnr(problem, solve_direct(problem, FusionOptions(v)).value, truth)
-        for v in ("full", "uniform", "texel_mean", "object_mean")
+        v: oracle_psnr(problem, solve_variant(problem, v).value, truth) for v in ("full", "uniform", "texel_mean", "object_mean")
     }
     assert psnr["full"] > psnr["uniform"] + 0.8
     assert psnr["uniform"] > psnr["texel_mean"] + 0.3
@@ -132,7 +132,7 @@ def test_affine_predictions_are_made_consistent():
     """With exact affine errors the texture is an affine map of the truth, far closer than the plain mean."""
     problem, truth = planted()
     full, mean = (
-        solve_direct(problem, FusionOptions(v, sweeps=30, anneal=0.8, ridge=1e-3)).value for v in ("uniform", "texel_mean")
+        solve_variant(problem, v, FusionOptions(sweeps=30, anneal=0.8, ridge=1e-3)).value for v in ("uniform", "texel_mean")
     )
     assert oracle_psnr(problem, full, truth) > 45
     assert oracle_psnr(problem, full, truth) > oracle_psnr(problem, mean, truth) + 10
@@ -164,7 +164,7 @@ def test_good_predictions_are_selected():
 
 def test_level_is_that_of_the_predictions_and_contrast_stays_over_many_sweeps():
     problem, truth = simulated()
-    few, many = (solve_direct(problem, FusionOptions("uniform", sweeps=n)) for n in (12, 150))
+    few, many = (solve_variant(problem, "uniform", FusionOptions(sweeps=n)) for n in (12, 150))
     weight = np.bincount(
         np.concatenate([c.ravel() for c in problem.cell_of_pixel]),
         np.concatenate([w.ravel() for w in problem.weight]),
@@ -238,7 +238,7 @@ def test_same_bytes_again_streamed_and_with_threads():
 def test_half_precision_input():
     problem, _ = simulated()
     half = replace(problem, predictions=[p.astype(np.float16) for p in problem.predictions])
-    a, b = (solve_direct(p, FusionOptions("uniform")).value for p in (problem, half))
+    a, b = (solve_variant(p, "uniform").value for p in (problem, half))
     np.testing.assert_allclose(a, b, atol=2e-3)
 
 
@@ -342,7 +342,7 @@ def test_scale_equals_the_closed_form():
     problem = FusionProblem(
         predictions, [np.zeros(1, int)] * 3, [np.array([i]) for i in range(3)], 1, np.zeros(1, int), np.zeros(3, int)
     )
-    result = solve_direct(problem, FusionOptions("texel_mean"))
+    result = solve_variant(problem, "texel_mean")
     mean = values.mean(1)
     assert result.value[0, 1] == pytest.approx(values.mean())
     b_ref = np.maximum(np.sort(np.abs(values - mean[:, None]), 1)[:, 1], 0.01)
@@ -396,7 +396,7 @@ def test_one_prediction_is_used_as_it_is_but_corrected():
     problem, truth = simulated(samples=1)
     result = solve_direct(problem)
     assert finite(result) and (result.weight == 1).all() and result.history[-1]["entropy"] == 0
-    mean = solve_direct(problem, FusionOptions("texel_mean"))
+    mean = solve_variant(problem, "texel_mean")
     assert oracle_psnr(problem, result.value, truth) > oracle_psnr(problem, mean.value, truth)
 
 
@@ -518,20 +518,8 @@ def test_border_pixels_weigh_little():
     cell = np.arange(100).reshape(10, 10)
     good, bad = np.full((1, 10, 10, 5), 0.4), np.full((1, 10, 10, 5), 0.8)
     problem = problem_of([cell, cell], [good, bad], obj, 0)
-    result = solve_direct(replace(problem, weight=[np.ones((10, 10)), np.full((10, 10), 0.1)]), FusionOptions("texel_mean"))
+    result = solve_variant(replace(problem, weight=[np.ones((10, 10)), np.full((10, 10), 0.1)]), "texel_mean")
     np.testing.assert_allclose(result.value, (0.4 + 0.08) / 1.1, atol=1e-6)
-
-
-def test_robust_update_ignores_an_outlier():
-    obj = np.zeros(100, int)
-    cell = np.arange(100).reshape(10, 10)
-    rng = np.random.default_rng(0)
-    truth = rng.uniform(0.3, 0.6, (1, 10, 10, 5))
-    predictions = [truth + 0.005 * rng.standard_normal(truth.shape) for _ in range(5)]
-    predictions[0][0, 3, 3] = 0.99
-    problem = problem_of([cell] * 5, predictions, obj, 0)
-    plain, robust = (solve_direct(problem, FusionOptions(robust=r)).value[33, 0] for r in (False, True))
-    assert abs(robust - truth[0, 3, 3, 0]) < 0.3 * abs(plain - truth[0, 3, 3, 0])
 
 
 def test_prediction_faults():

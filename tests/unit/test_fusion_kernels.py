@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from iif_core.fusion import kernels
 from iif_core.fusion.problem import LOWEST
-from iif_core.numerics import laplace
+from lab.published.fusion.divergence import reference_scale
+from lab.published.fusion.sgd.pool import as_floats
 
 NONE = np.zeros((0, 0), bool)
 
@@ -66,7 +67,7 @@ def test_mixture_and_disagreement_equal_numpy(half):
     pixels_of_view = kernels.Pixels(words, got, target, weight, start)
     b_ref, votes = kernels.disagreement(pixels_of_view, affine, usable, kernels.sorting_network(4), LOWEST, 0.01)
     corrected = np.clip(corrected[usable], LOWEST[:, None], 1)
-    np.testing.assert_allclose(b_ref, laplace.reference_scale(mixed, corrected), atol=4e-6)
+    np.testing.assert_allclose(b_ref, reference_scale(mixed, corrected), atol=4e-6)
     error = np.abs(corrected - target)
     nearest = np.flatnonzero(usable)[np.stack([error[:, :3].sum(1), error[:, 3], error[:, 4]], 1).argmin(0)]  # (3, n)
     for p in range(3):
@@ -116,7 +117,7 @@ def test_gather_clamps_and_finite_pixels_finds_every_bad_value(dtype):
     np.testing.assert_array_equal(kernels.finite_pixels(words), [[True, False, True]])
     values, inside = kernels.gather(words, np.array([2, 0]), np.array([True]))
     expected = np.array([[0.1, 0], [0.2, 0], [0.3, 0.25], [0.4, 1], [0.5, 1]], dtype).astype(np.float32)
-    np.testing.assert_array_equal(kernels.as_floats(values)[0], expected)
+    np.testing.assert_array_equal(as_floats(values)[0], expected)
     np.testing.assert_array_equal(inside, [[True, False]])
 
 

@@ -186,8 +186,8 @@ def test_wrong_input_is_refused():
 
 def test_flip_of_equal_images_is_zero():
     truth = image(11)
-    assert m.flip(truth, truth, ALL) == 0.0
-    assert m.flip(1 - truth, truth, ALL) > 0.2
+    assert single.flip(truth, truth, ALL) == 0.0
+    assert single.flip(1 - truth, truth, ALL) > 0.2
 
 
 @pytest.mark.parametrize("encoded", [False, True])
@@ -202,7 +202,7 @@ def test_flip_is_the_published_one(encoded):
         theirs = np.asarray(evaluate(truth, prediction, "LDR", inputsRGB=encoded, applyMagma=False, computeMeanError=False)[0])
         ours = flip.difference(flip.Seen(prediction, encoded), flip.Seen(truth, encoded))
         np.testing.assert_allclose(ours, theirs[..., 0], atol=1e-3)
-        assert m.flip(prediction, truth, np.ones((50, 70), bool), encoded) == pytest.approx(theirs.mean(), abs=3e-5)
+        assert single.flip(prediction, truth, np.ones((50, 70), bool), encoded) == pytest.approx(theirs.mean(), abs=3e-5)
 
 
 def test_ssim_of_colours_is_the_common_one():
@@ -229,7 +229,7 @@ def test_one_target_scores_many_predictions():
             ("scaled", single.scaled(prediction, truth, mask)),
             ("oracle_affine", single.oracle_affine(prediction, truth, mask, objects)),
         ):
-            for name, function in (("l2", single.l2), ("psnr", single.psnr), ("ssim", single.ssim), ("flip", m.flip)):
+            for name, function in (("l2", single.l2), ("psnr", single.psnr), ("ssim", single.ssim), ("flip", single.flip)):
                 assert scores[protocol, name] == pytest.approx(function(seen, truth, mask), rel=1e-9), (protocol, name)
     some = values(target.scores(image(18), ("l2", "flip"), perceptual=("raw",)))
     assert set(some) == {("raw", "l2"), ("raw", "flip"), ("scaled", "l2"), ("oracle_affine", "l2")}

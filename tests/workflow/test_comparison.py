@@ -13,7 +13,7 @@ from workflow.artifacts import StageReader
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.files import write_exr
 from workflow.artifacts.store import rgb, split_rgb
-from workflow.comparison.maps import find, own_maps, read_map
+from workflow.comparison.maps import find, read_map
 
 
 def fails(workflow, *arguments: str) -> str:
@@ -28,8 +28,10 @@ def hand_over(folder: Path, maps: Path) -> None:
     rendered = StageReader(folder / "results/tiny/render", "render", "tiny")
     for name in fitted.names("maps/"):
         view, channels = Path(name).stem, rendered.exr(name)
-        for quantity, values in own_maps(fitted, view).items():
-            write_exr(maps / quantity / f"{view}.exr", split_rgb(values) if values.ndim == 3 else {"Y": values})
+        own = fitted.exr(f"maps/{view}.exr")
+        write_exr(maps / f"albedo/{view}.exr", split_rgb(rgb(own, "albedo")))
+        for quantity in ("roughness", "metallic"):
+            write_exr(maps / f"{quantity}/{view}.exr", {"Y": own[quantity].astype(np.float32)})
         write_exr(maps / f"emission/{view}.exr", split_rgb(rgb(channels, "emission")))
         write_exr(maps / f"rgb/{view}.exr", split_rgb(rgb(channels)))
 

@@ -331,13 +331,3 @@ def _strips(view: View, own: Mapping[str, np.ndarray], truth: MaterialTruth) -> 
             Picture("difference, 0 to 0.25", pictures.data_uri(pictures.difference(found, wanted, mask))),
         ]
         yield Strip(f"{view.name}, {quantity}", tiles)
-
-
-def own_maps(reader: StageReader, view: str) -> dict[str, np.ndarray]:
-    """Return albedo, roughness and metallic of a view of stage affines, to hand them to somebody in the layout of `find`."""
-    channels = reader.exr(f"maps/{view}.exr")
-    return {
-        "albedo": rgb(channels, "albedo"),
-        "roughness": channels["roughness"].astype(np.float32),
-        "metallic": channels["metallic"].astype(np.float32),
-    }

@@ -10,7 +10,7 @@ import numpy as np
 
 from iif_core.numerics.color import srgb_from_linear, to_uint8
 from iif_core.reflectance.material import BLACK
-from iif_core.surface.atlas import nearest_covered, texel_surface, texel_values
+from iif_core.surface.atlas import nearest_covered, texel_surface, texel_values, texels_around
 from iif_core.surface.closest import closest_points
 from iif_core.surface.lookup import values_at
 from workflow.artifacts.store import StageReader
@@ -168,7 +168,7 @@ def texels_beside(parts: Sequence[TexturedPart], texels: Texels) -> tuple[Texels
         because where surface ends there often is other surface; and (t,) bool, whether the texel contains surface.
     """
     charts, size = _charts(parts), texels.size
-    free = np.ones(size * size, bool)
+    free = texels_around(charts.uv, charts.faces, size, 1.5).ravel()  # a search for those farther than sqrt(2) would be in vain
     free[texels.index] = False
     index = np.flatnonzero(free)
     plane = np.concatenate([charts.uv * np.float32(size), np.zeros((len(charts.uv), 1), np.float32)], 1)

@@ -13,18 +13,29 @@ What is left is the difference in shape of the specular lobes.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.reflectance.brdf import kd_ks
 from iif_core.reflectance.directional_albedo import COSINES, directional_albedo
-from workflow.runtime import device
 
 ROUGHNESS = np.linspace(0.05, 1.0, 20)
 """Perceptual roughness of the table; both models change little below."""
-_ANGLES, _SAMPLES = 16, 4096
+METAL = np.array(
+    [
+        0.04431793768216618, 0.044157480951222, 0.04353011760007414, 0.04167000374257049, 0.038707815145325515,
+        0.03470289691811104, 0.03025047692524713, 0.02567139732287569, 0.021350738449451737, 0.01773958042677241,
+        0.014511957248653756, 0.011737782794381943, 0.009427509486921577, 0.007540946988427617, 0.006015309221439343,
+        0.004794729322214921, 0.003823303539682204, 0.0030497571053666813, 0.0024292384248790024, 0.001937011846264946,
+        0.9999940649131531, 0.9999042444824227, 0.9994366935570724, 0.9972521560989662, 0.9929285830298795,
+        0.985357623229568, 0.9728461920880989, 0.9454103647095051, 0.9032422543694025, 0.8822223028600149,
+        0.8401879756853949, 0.7980184119044011, 0.7473817266676175, 0.696462988376837, 0.6422369103671235,
+        0.5869355027499727, 0.5316228235444753, 0.477390032714352, 0.425340454503796, 0.3762271659781389,
+    ]
+).reshape(2, 20)  # fmt: skip
+"""P and P + Q: the metal of `principled` with base colour 0 and 1 at each `ROUGHNESS`, averaged over all directions. They
+depend on Mitsuba alone; tests/oracles/mitsuba_lobes.py integrates them."""
 
 
 def blended(albedo: NDArray, roughness: NDArray, metallic: NDArray) -> tuple[NDArray, NDArray]:
@@ -37,46 +48,10 @@ def blended(albedo: NDArray, roughness: NDArray, metallic: NDArray) -> tuple[NDA
         Two (n, 3) float32; both go up to about 2.
     """
     kd, ks = kd_ks(albedo, np.asarray(metallic)[:, None])
-    black, white = (np.interp(roughness, ROUGHNESS, row)[:, None] for row in metal_reflectance())
+    black, white = (np.interp(roughness, ROUGHNESS, row)[:, None] for row in METAL)
     first, second = (np.interp(roughness, ROUGHNESS, row)[:, None] for row in _ours())
     wanted = 2 * (first * ks + second)
     return (2 * kd).astype(np.float32), np.maximum((wanted - black) / (white - black), 0).astype(np.float32)
-
-
-@lru_cache(maxsize=1)
-def metal_reflectance() -> NDArray:
-    """Integrate the metal of `principled` over all directions: (2, 20) by base colour 0 or 1, and `ROUGHNESS`.
-
-    Directions are drawn by the plug-in, on strata of its two dimensions, for cosines of the viewer at the middle of equal shares
-    of the projected hemisphere.
-    """
-    mi = device.mitsuba()
-    return np.array([[_reflectance(mi, base, r) for r in ROUGHNESS] for base in (0.0, 1.0)])
-
-
-def _reflectance(mi: Any, base: float, roughness: float) -> float:
-    import drjit as dr
-
-    bsdf = mi.load_dict(
-        {
-            "type": "principled",
-            "base_color": {"type": "rgb", "value": base},
-            "metallic": 1.0,
-            "roughness": float(roughness),
-        }
-    )
-    count = _ANGLES * _SAMPLES
-    index = np.arange(count)
-    side = int(np.sqrt(_SAMPLES))
-    own = index % _SAMPLES
-    cosine = np.sqrt((index // _SAMPLES + 0.5) / _ANGLES)
-    si = dr.zeros(mi.SurfaceInteraction3f, count)
-    si.wi = mi.Vector3f(np.sqrt(1 - cosine**2).astype(np.float32), 0.0, cosine.astype(np.float32))
-    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
-    square = mi.Point2f(((own % side + 0.5) / side).astype(np.float32), ((own // side + 0.5) / side).astype(np.float32))
-    lobe = mi.Float((np.modf(own * 0.6180339887498949)[0]).astype(np.float32))  # golden ratio: every stratum meets every lobe
-    _, weight = bsdf.sample(mi.BSDFContext(), si, lobe, square)
-    return float(np.array(weight.x, np.float64).mean())
 
 
 @lru_cache(maxsize=1)

@@ -37,16 +37,6 @@ TABLE_ROWS = 1 << 16
 """Rows of a camera response."""
 ARRAY_BYTES = 256 << 20
 """Size of an array of NumPy: of a camera response, or of exposures."""
-XML_BYTES = 16 << 20
-"""Size of a Mitsuba XML file. The largest scene in use has 0.6 MB."""
-XML_ELEMENTS = 200_000
-"""Elements of the XML files of a scene."""
-XML_FILES = 256
-"""XML files of a scene."""
-XML_DEFAULTS = 1_000
-"""`<default>` values of a scene."""
-XML_DEPTH = 64
-"""Levels of elements in a Mitsuba XML file."""
 TEXT = 4_096
 """Characters of a path, or of any other text of a file name."""
 NUMBER = 1e12

@@ -10,8 +10,6 @@ import numpy as np
 
 from iif_core.errors import InputError
 
-NOTE = "photographs denoised (Intel Open Image Denoise): biased, and so is the radiance truth"
-
 
 def require_denoiser() -> None:
     """Raise InputError if the denoiser cannot be loaded."""
@@ -28,11 +26,6 @@ def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.
     """Denoise a linear HDR picture (H, W, 3), guided by noise-free albedo and world normals."""
     images = [np.ascontiguousarray(image, np.float32) for image in (radiance, albedo, normal)]
     return np.maximum(_oidn().denoise(*images, hdr=True, clean_aux=True), 0)
-
-
-def denoise_alone(radiance: np.ndarray) -> np.ndarray:
-    """Denoise a linear HDR picture (H, W, 3) without guides."""
-    return np.maximum(_oidn().denoise(np.ascontiguousarray(radiance, np.float32), hdr=True), 0)
 
 
 def _oidn() -> ModuleType:

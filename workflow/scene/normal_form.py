@@ -97,25 +97,6 @@ class CaptureWriter:
         """Write the object ids (H, W) that the source gives for a view, -1 = none."""
         self.writer.exr(f"given/{name}.exr", {"instance.id": ids_to_disk(instance_id)})
 
-    def rendered(self, name: str, depth: np.ndarray, face_id: np.ndarray, truth: Truth, facts: dict[str, Any]) -> None:
-        """Write G-buffer and truth of a view, which a job that is killed and started again takes over with the `facts`."""
-        self.gbuffer(name, depth, face_id)
-        self.truth(name, truth)
-        self.writer.part_done(name, [f"gbuffer/{name}.exr", f"truth/{name}.exr"], facts)
-
-    def kept(self, name: str) -> tuple[np.ndarray, np.ndarray, dict[str, Any]] | None:
-        """Take over a view that was `rendered` before the job was killed.
-
-        Returns:
-            True radiance (H, W, 3), whether a pixel shows the surface of an emitter (H, W), and the facts; None if the view is to
-            be rendered.
-        """
-        facts = self.writer.part_kept(name)
-        if facts is None:
-            return None
-        truth = self.writer.channels(f"truth/{name}.exr")
-        return rgb(truth, "radiance"), rgb(truth, "emission").any(-1), facts
-
     def truth(self, name: str, truth: Truth) -> None:
         """Write the ground truth of one view."""
         channels = {

@@ -72,13 +72,13 @@ class VoxelPixels:
         """Find the voxels of pixels at `points` (n, 3), m. Radiance has to be finite.
 
         Raises:
-            InputError: as `RadianceSums.add`.
+            InputError: edge not positive, or a point outside the 65536 voxels an axis from the origin.
         """
         keys, voxel = np.unique(pack_keys(voxel_indices(points, edge, origin)), return_inverse=True)
         return cls(float(edge), np.asarray(origin, np.float32), keys, voxel.astype(np.int32), radiance, censored)
 
     def cache(self, use: np.ndarray) -> RadianceVoxels:
-        """Return the cache of the pixels `use`, (n,) bool: bit for bit what `RadianceSums` gives for them in their order."""
+        """Return the cache of the pixels `use`, (n,) bool. Those of one voxel are added in their order."""
         size = len(self.keys)
         plain, clipped = np.flatnonzero(use & ~self.censored), np.flatnonzero(use & self.censored)
         voxel = self.voxel[plain]
@@ -92,61 +92,3 @@ class VoxelPixels:
         radiance = np.where(bound[:, None], largest[own], mean).astype(np.float32)
         samples = np.where(bound, bounds[own], count[own]).astype(np.int32)
         return RadianceVoxels(self.edge, self.origin, unpack_keys(self.keys[own])[0], radiance, samples, bound)
-
-
-class RadianceSums:
-    """Running sums per voxel: `add` the pixels of one view after another, then `finish`.
-
-    Args:
-        edge: voxel edge in m.
-        origin: (3,) corner of voxel (0, 0, 0), below all points: `cells.grid_origin` of the mesh.
-    """
-
-    def __init__(self, edge: float, origin: np.ndarray):
-        self.edge, self.origin = float(edge), np.asarray(origin, np.float32)
-        self._key = np.zeros(0, np.uint64)
-        # columns: sum R G B, count, largest censored R G B, censored count
-        self._value = np.zeros((0, 8))
-
-    def add(self, points: np.ndarray, radiance: np.ndarray, censored: np.ndarray) -> None:
-        """Add pixels: points (n, 3) in m, radiance (n, 3) linear, censored (n,) bool; non-finite rows are left out.
-
-        The caller leaves out pixels on emitters (docs/method/numerics.md#emitters-in-the-radiance-cache).
-
-        Raises:
-            InputError: edge not positive, or a point outside the 65536 voxels an axis from the origin.
-        """
-        good = np.isfinite(radiance).all(-1) & np.isfinite(points).all(-1)
-        key = pack_keys(voxel_indices(np.asarray(points)[good], self.edge, self.origin))
-        value, clipped = np.asarray(radiance, np.float64)[good], np.asarray(censored)[good]
-        row = np.concatenate(
-            [
-                np.where(clipped[:, None], 0.0, value),
-                (~clipped)[:, None],
-                np.where(clipped[:, None], value, 0.0),
-                clipped[:, None],
-            ],
-            1,
-        )
-        key = np.concatenate([self._key, key])
-        row = np.concatenate([self._value, row])
-        if not len(key):
-            return
-        self._key, voxel = np.unique(key, return_inverse=True)
-        sums = np.stack([np.bincount(voxel, column, len(self._key)) for column in row.T], 1)
-        order = np.flatnonzero(row[:, 7])  # bounds are few, and their largest is what counts
-        largest = np.zeros((len(self._key), 3))
-        np.maximum.at(largest, voxel[order], row[order, 4:7])
-        # `bincount` has added up the bounds as well; their largest takes the place of the sum (Eq. L.6).
-        sums[:, 4:7] = largest
-        self._value = sums
-
-    def finish(self) -> RadianceVoxels:
-        """Return the cache of what was added so far."""
-        count, clipped = self._value[:, 3], self._value[:, 7]
-        bound = count == 0
-        mean = self._value[:, :3] / np.maximum(count, 1)[:, None]
-        radiance = np.where(bound[:, None], self._value[:, 4:7], mean)
-        ijk = unpack_keys(self._key)[0]
-        samples = np.where(bound, clipped, count).astype(np.int32)
-        return RadianceVoxels(self.edge, self.origin, ijk, radiance.astype(np.float32), samples, bound)

@@ -104,7 +104,7 @@ class EmissionPrior:
 
     def radiance_and_light(self, rows: EmissionRows, max_rounds: int = 20) -> tuple[np.ndarray, np.ndarray]:
         """Return `radiance`, and A E with the mean of the two traces, (n, 3)."""
-        channels = _channels(rows, np.asarray(self.initial, np.float64), True, RIDGE, self.width, self.correlation)
+        channels = _channels(rows, np.asarray(self.initial, np.float64), RIDGE, self.width, self.correlation)
         found = [channel.solve(max_rounds) for channel in channels]
         if not found:
             return self.initial.copy(), np.zeros(rows.observed.shape)
@@ -114,7 +114,6 @@ class EmissionPrior:
 def solve_emission(
     rows: EmissionRows,
     initial: np.ndarray,
-    cross: bool = True,
     ridge: float = RIDGE,
     max_rounds: int = 20,
     prior_width: float | np.ndarray = SINGLE_WIDTH,
@@ -130,7 +129,6 @@ def solve_emission(
         rows: the system (see `block_rows`).
         initial: (G, 3) E0 >= 0, where the answer stays when the data do not determine it (unseen group, noise, duplicate
             columns).
-        cross: normal matrix from both traces of A (unbiased); False = from their mean (biased low, always definite).
         ridge: weight of E0 relative to the diagonal of the normal matrix.
         max_rounds: of the re-weighting.
         prior_width: number or (G,), standard deviation of E relative to E0; infinity switches the prior off.
@@ -145,7 +143,7 @@ def solve_emission(
     """
     groups, initial = rows.groups, np.asarray(initial, np.float64)
     found, errors = [], []
-    for channel in _channels(rows, initial, cross, ridge, prior_width, correlation):
+    for channel in _channels(rows, initial, ridge, prior_width, correlation):
         found.append(channel.solve(max_rounds))
         errors.append(channel.uncertainty(found[-1].radiance, found[-1].variance, family))
     if not found:
@@ -168,7 +166,6 @@ def solve_emission(
 def _channels(
     rows: EmissionRows,
     initial: np.ndarray,
-    cross: bool,
     ridge: float,
     prior_width: float | np.ndarray,
     correlation: np.ndarray | None,
@@ -185,7 +182,7 @@ def _channels(
     matrices, targets = rows.matrices, rows.targets
     cluster = np.full(len(rows.observed), -1) if rows.cluster is None else rows.cluster
     for c in range(3):
-        prior = initial[:, c], _width(initial[:, c], prior_width), cross, ridge, correlation
+        prior = initial[:, c], _width(initial[:, c], prior_width), ridge, correlation
         both = (np.ascontiguousarray(a[:, :, c]) for a in matrices)
         data = *both, *(t[:, c] for t in targets), rows.weight[:, c], rows.lower_bound[:, c]
         yield _ChannelRows(*data, cluster, rows.noise, *prior)
@@ -292,7 +289,7 @@ class _ChannelRows:
     Attributes:
         first, second: (n, G) float32, contiguous; target, target_second, weight: (n,); bound: (n,) bool.
         cluster: (n,) int; noise: (n,) or None.
-        initial, width: (G,) mean and standard deviation of the prior; cross, ridge, correlation: as in `solve_emission`.
+        initial, width: (G,) mean and standard deviation of the prior; ridge, correlation: as in `solve_emission`.
     """
 
     first: np.ndarray
@@ -305,7 +302,6 @@ class _ChannelRows:
     noise: np.ndarray | None
     initial: np.ndarray
     width: np.ndarray
-    cross: bool
     ridge: float
     correlation: np.ndarray | None = None
 
@@ -348,17 +344,14 @@ class _ChannelRows:
             t1, t2 = self.target[part] + extra, self.target_second[part] + extra
             # M contains the noise of the traces (Eq. L.23).
             m += mean.T @ (w[:, None] * mean)
-            if self.cross:
-                # Every product takes one factor from either trace. Their noise is independent, so it has no part in the
-                # expectation (Eq. L.22).
-                b += 0.5 * (a1.T @ (w * t2) + a2.T @ (w * t1))
-                # The symmetric part is H. The antisymmetric part K is noise alone.
-                product = a1.T @ (w[:, None] * a2)
-                h += 0.5 * (product + product.T)
-                k += 0.5 * (product - product.T)
-            else:
-                b += mean.T @ (w * 0.5 * (t1 + t2))
-        return h if self.cross else m, k, m, b
+            # Every product takes one factor from either trace. Their noise is independent, so it has no part in the expectation
+            # (Eq. L.22).
+            b += 0.5 * (a1.T @ (w * t2) + a2.T @ (w * t1))
+            # The symmetric part is H. The antisymmetric part K is noise alone.
+            product = a1.T @ (w[:, None] * a2)
+            h += 0.5 * (product + product.T)
+            k += 0.5 * (product - product.T)
+        return h, k, m, b
 
     def scores(self, answer: np.ndarray) -> np.ndarray:
         """S of Eq. L.27, over clusters of rows that are no bounds: (G, G)."""
@@ -369,9 +362,6 @@ class _ChannelRows:
             w = weight[part, None]
             a1, a2 = self.first[part].astype(np.float64), self.second[part].astype(np.float64)
             r1, r2 = self.target[part] - a1 @ answer, self.target_second[part] - a2 @ answer
-            if not self.cross:
-                a1 = a2 = 0.5 * (a1 + a2)
-                r1 = r2 = 0.5 * (r1 + r2)
             # Score of a row: one trace times the residual of the other (Eq. L.27).
             parts.append(0.5 * w * (a1 * r2[:, None] + a2 * r1[:, None]))
         single = np.concatenate(parts)

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
 from iif_core.light.transport.arrays import batches, on_device, rows_of, to_numpy
-from iif_core.light.transport.kernels import World, incoming, uniform
+from iif_core.light.transport.kernels import World
+from iif_core.light.transport.render import radiance_sum
 from iif_core.light.transport.scene import PathOptions, Scene
 
 Array = np.ndarray
@@ -61,23 +62,6 @@ def checked_lamps(scene: Scene, lamp_of_face: ArrayLike, lamps: int, environment
     return of_face
 
 
-@dr.syntax
-def _follow(
-    world: World, rng: Any, origin: Any, direction: Any, d_du: Any, d_dv: Any, sample: Any, end: Any, max_bounces: Any
-) -> Any:
-    """Follow the paths of every lane; the collector holds the result, and the returned gain is 0."""
-    nothing = mi.Color3f(0)
-    while sample < end:
-        du = uniform(rng) - 0.5
-        dv = uniform(rng) - 0.5
-        toward = dr.normalize(direction + du * d_du + dv * d_dv)
-        # Nothing else finds what a camera ray meets; an infinite density gives it weight 1.
-        gain, rng = incoming(world, rng, origin, toward, dr.inf, 0, max_bounces, True)
-        nothing += gain
-        sample += 1
-    return nothing
-
-
 def render_lamps(
     scene: Scene,
     lamp_of_face: ArrayLike,
@@ -124,7 +108,7 @@ def render_lamps(
         sums = dr.zeros(mi.Float, batch.lanes * 3 * lamps)
         lane = dr.arange(mi.UInt32, batch.lanes)
         world = World(scene, LampCollector(sums, lane, lamps, of_face, environment_lamp))
-        gain = _follow(
+        gain = radiance_sum(
             world,
             batch.streams(paths.seed),
             *(batch.spread(kind, part) for kind, part in zip(kinds, rows, strict=True)),

@@ -19,7 +19,7 @@ Array = np.ndarray
 
 
 @dr.syntax
-def _radiance_sum(
+def radiance_sum(
     world: World,
     rng: Any,
     origin: Any,
@@ -30,6 +30,7 @@ def _radiance_sum(
     end: Any,
     max_bounces: Any,
 ) -> Any:
+    """Sum over the paths of every lane of what its ray gains; a collector that keeps the light itself lets it gain 0."""
     total = mi.Color3f(0)
     while sample < end:
         du = uniform(rng) - 0.5
@@ -81,7 +82,7 @@ def render(
     world = World(scene, RadianceCollector())
     result = np.zeros(directions.shape, np.float32)
     for batch in batches(len(directions), paths.samples, 3, paths.chunk):
-        total = _radiance_sum(
+        total = radiance_sum(
             world,
             batch.streams(paths.seed),
             batch.spread(mi.Point3f, origins),

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iif_core.camera.response import Response
-from iif_core.fitting.pixels import darkest_and_tone, prepare_pixels, residuals
+from iif_core.fitting.pixels import Tone, _brightness, _finite, make_tone, prepare_pixels, residuals
 from iif_core.fitting.problem import FitOptions, FitProblem
 from iif_core.reflectance.material import apply_affines
 
@@ -45,6 +45,21 @@ def reference_problem(problem: FitProblem, response: Response) -> FitProblem:
         return mean
     with np.errstate(invalid="ignore"):
         return replace(mean, saturated=problem.saturated | (problem.value >= CLAMP), value=np.minimum(problem.value, CLAMP))
+
+
+def darkest_and_tone(problem: FitProblem, response: Response, chunk: int) -> tuple[float, Tone]:
+    """Return what `prepare_pixels` finds from all pixels, looking at `chunk` of them together.
+
+    These are the light below which pixels are left out (docs/method/numerics.md#pixels-without-light), a thousandth of the median
+    of exposure times diffuse light over pixels that are finite, exposed, and of an object; and the curve that residuals are
+    measured in.
+    """
+    parts = [problem.take(slice(first, first + chunk)) for first in range(0, len(problem.object_id), chunk)]
+    # The parts are views. Looking at one after another keeps the temporary arrays small.
+    use = np.concatenate([_finite(part) for part in parts] or [np.zeros(0, bool)])
+    brightness = np.concatenate([_brightness(part) for part in parts] or [np.zeros(0)])
+    darkest = 1e-3 * float(np.median(brightness[use])) if use.any() else 0.0
+    return darkest, make_tone(response, problem.value[use & (brightness > darkest)])
 
 
 def reference_options(**changes: object) -> FitOptions:

@@ -8,16 +8,28 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from iif_core.errors import InputError
+from iif_core.fusion import kernels
 from iif_core.fusion.direct import alternate
-from iif_core.fusion.fusion_pass import first_pass
+from iif_core.fusion.fusion_pass import FusionPass, first_pass
 from iif_core.fusion.options import FusionOptions
-from iif_core.fusion.outcome import build_result, measure_errors
+from iif_core.fusion.outcome import build_result
 from iif_core.fusion.problem import LOWEST, FusionProblem, FusionResult
+from iif_core.fusion.sums import NO_MASK
 from lab.published.fusion.polish import fix_selection, minimise_distribution_loss
 
 POLISH = 25
 """Sweeps on the paper's loss."""
+
+
+def measure_errors(run: FusionPass, texture: NDArray) -> None:
+    """Write the mean squared error of every corrected prediction against the texture (n_cells, 5) to the state."""
+    for block in run.map_views(run.blocks):
+        rows, target = block.segments, kernels.texture_at(texture, block.cell)
+        weight = run.sums.fit_weight(block)
+        # No mask: errors count all pixels, also those that the fit of the albedo map leaves out.
+        cross = kernels.cross(block.values, target, weight, block.start, NO_MASK)
+        square = kernels.square(target, weight, block.start)
+        run.state.error[rows] = run.sums.errors(rows, run.state.affine[rows], cross, square)
 
 
 def solve_distribution(
@@ -40,11 +52,9 @@ def solve_distribution(
         The base texture with its maps, selection and uncertainty.
 
     Raises:
-        InputError: the variant makes no selection, or as `solve_direct`.
+        InputError: as `solve_direct`.
     """
     options = options or FusionOptions()
-    if options.variant != "full":
-        raise InputError(f"`objective: distribution` needs a selection; `variant: {options.variant}` makes none")
     # With a given selection maps and texture start again, so further sweeps of least squares would be lost.
     sweeps = 1 if chosen is not None else options.sweeps
 
@@ -89,8 +99,7 @@ def describe_fit(
     Raises:
         InputError: shapes that do not match, ids out of range, a segment in two views.
     """
-    # Only the first texture depends on the variant, and nothing here reads it.
-    run, _ = first_pass(problem, FusionOptions("texel_mean", memory=memory), threads)
+    run, _ = first_pass(problem, FusionOptions(memory=memory), threads)
     run.state.affine, run.state.alpha = affine.astype(np.float64), weight.astype(np.float64)
     texture = np.clip(value, LOWEST, 1.0).astype(np.float32)
     measure_errors(run, texture)

@@ -16,7 +16,7 @@ from iif_core.fusion.scales import cell_scales, reference_distribution
 from iif_core.fusion.sums import CellSums, SegmentState, SegmentSums, sweep_summary
 from iif_core.numerics import laplace
 from iif_core.reflectance.material import IDENTITY
-from lab.published.fusion import matching
+from lab.published.fusion import divergence, matching
 from lab.published.fusion.kernels import channel_moments, choose
 
 _ALBEDO_ENTRIES = np.array([[0, 1, 2, 6], [1, 3, 4, 7], [2, 4, 5, 8], [6, 7, 8, 9]])  # of channel_moments, as a 4x4 matrix
@@ -77,13 +77,13 @@ def minimise_distribution_loss(
         planes = choose(block.values, chosen[rows], block.start)
         target, b = kernels.texture_at(texture, block.cell), kernels.texture_at(scale, block.cell)
         mixed, b_ref, _ = reference_distribution(run, block, target)
-        weight = block.weight * laplace.kl_weight(mixed - target, b_ref, b, floor).astype(np.float32) / 5
+        weight = block.weight * divergence.kl_weight(mixed - target, b_ref, b, floor).astype(np.float32) / 5
         second, first = channel_moments(planes, target, weight, block.start)
         strength = matching.REGULARISER * pixels[rows] / np.maximum(sums.usable[rows].sum(1), 1)
         state.affine[rows] = _penalised(state.affine[rows], chosen[rows], second, first, strength)
         mixed, b_ref, _ = reference_distribution(run, block, target)
-        loss = (block.weight * laplace.kl(mixed - target, b_ref, b, floor)).sum(dtype=np.float64) / 5
-        weight = block.weight * laplace.kl_weight(mixed - target, b_ref, b, floor).astype(np.float32)
+        loss = (block.weight * divergence.kl(mixed - target, b_ref, b, floor)).sum(dtype=np.float64) / 5
+        weight = block.weight * divergence.kl_weight(mixed - target, b_ref, b, floor).astype(np.float32)
         part = laplace.scale_contribution(mixed - target, b_ref, floor)
         return block, mixed, weight, part, float(loss)
 

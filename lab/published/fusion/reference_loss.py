@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from iif_core.errors import InputError
 from iif_core.fusion.problem import LOWEST, FusionProblem, FusionResult, usable_pixels
-from iif_core.numerics import laplace
+from lab.published.fusion import divergence
 from lab.published.fusion.matching import REGULARISER, identity_penalty
 
 if TYPE_CHECKING:
@@ -91,8 +91,8 @@ def reference_loss(
             corrected = _corrected(maps[k][:, pixel].astype(np.float64), corrections, segment, k)  # (k, n, 5)
             alpha = weight[segment][:, k].swapaxes(0, 1)  # (k, n, 3)
             mu_ref = (alpha[..., _PROPERTY_OF_CHANNEL] * corrected).sum(0)
-            b_ref = laplace.reference_scale(mu_ref, corrected)
-            data += float(count @ laplace.kl(mu_ref - mu, b_ref, b).mean(1))
+            b_ref = divergence.reference_scale(mu_ref, corrected)
+            data += float(count @ divergence.kl(mu_ref - mu, b_ref, b).mean(1))
             penalty += count @ distance[segment][:, k].mean(1)
             n_pixels += len(pixel)
     if not n_pixels:

@@ -12,7 +12,6 @@ from functools import partial
 
 import numpy as np
 
-from iif_core.fusion.direct import solve_direct
 from iif_core.fusion.options import FusionOptions
 from iif_core.fusion.problem import FusionProblem, FusionResult
 from lab.published.fusion.direct import describe_fit, solve_distribution
@@ -20,6 +19,7 @@ from lab.published.fusion.matching import REGULARISER
 from lab.published.fusion.reference_loss import loss_of_result
 from lab.published.fusion.sgd.options import preset_grid, sgd_options
 from lab.published.fusion.sgd.solve import SgdFit, SgdState, converged, solve_sgd
+from lab.published.fusion.variants import solve_variant
 from lab.published.state import keep_state, kept_state
 from workflow.artifacts.scratch import Scratch
 from workflow.artifacts.store import split_rgb
@@ -77,16 +77,11 @@ def _solve(job: Job, problem: FusionProblem) -> tuple[FusionResult, SgdFit | Non
         texture = fit.value, fit.scale, fit.corrections, fit.alpha
         return describe_fit(problem, *texture, fit.history, job.threads, MEMORY_BYTES), fit
     progress = partial(job.progress, what="passes over the views")
-    options = options_of(
-        FusionOptions,
-        settings,
-        variant={"raw": "texel_mean", "image_affine": "full"}.get(settings.variant, settings.variant),
-        memory=MEMORY_BYTES,
-        spill=Scratch(job.writer.directory),
-    )
+    options = options_of(FusionOptions, settings, memory=MEMORY_BYTES, spill=Scratch(job.writer.directory))
     if settings.objective == "distribution":
         return solve_distribution(problem, options, progress, job.threads, settings.polish), None
-    return solve_direct(problem, options, progress, job.threads), None
+    variant = {"raw": "texel_mean", "image_affine": "full"}.get(settings.variant, settings.variant)
+    return solve_variant(problem, variant, options, progress, job.threads), None
 
 
 def _descended(job: Job, problem: FusionProblem) -> SgdFit:

@@ -16,7 +16,7 @@ from iif_core.camera.pinhole import direction_derivatives
 from iif_core.camera.response import Response, response, response_facts
 from iif_core.errors import InputError
 from iif_core.light.base_scene import BaseScene
-from iif_core.light.emission.cache import RadianceSums, RadianceVoxels
+from iif_core.light.emission.cache import RadianceVoxels, VoxelPixels
 from lab.published.light.descent import (
     THRESHOLD,
     PublishedOptions,
@@ -123,14 +123,16 @@ def _read(
         points = DecodedViews(capture, job.read("segmentation"), 0).pixels(view, scene.normals).points
         low, high = min(low, float(points.min(initial=np.inf))), max(high, float(points.max(initial=-np.inf)))
     corner, edge = bounding_cube(low, high) if np.isfinite(low) else (0.0, 1.0)
-    sums, total, count = RadianceSums(edge, np.full(3, corner, np.float32)), np.zeros((faces, 3)), np.zeros(faces)
+    total, count = np.zeros((faces, 3)), np.zeros(faces)
+    lit: list[tuple[np.ndarray, np.ndarray]] = []
     parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for number, view in enumerate(views):
         pixels = DecodedViews(capture, job.read("segmentation"), 0).pixels(view, scene.normals)
         pixels = pixels.take(np.flatnonzero(pixels.valid))
         shown = np.clip(pixels.value, 0, 1)
         radiance = curve.inverse(shown) / exposure[number]
-        sums.add(pixels.points, radiance, np.zeros(len(radiance), bool))
+        finite = np.isfinite(radiance).all(1)
+        lit.append((pixels.points[finite], radiance[finite]))
         tested = shown > THRESHOLD if job.settings.emission.solver == REPAIRED else radiance
         total += np.stack([np.bincount(pixels.face, tested[:, c], faces) for c in range(3)], 1)
         count += np.bincount(pixels.face, minlength=faces)
@@ -139,7 +141,10 @@ def _read(
     joined = [np.concatenate(part) for part in zip(*parts, strict=True)]
     pool = _Pool(joined[0], joined[1], joined[2], views, exposure)
     limit = SATURATED_SHARE if job.settings.emission.solver == REPAIRED else THRESHOLD
-    return pool, sums.finish(), bright_triangles(total / np.maximum(count, 1)[:, None], count, limit), count
+    points, radiance = (np.concatenate(part) for part in zip(*lit, strict=True))
+    voxels = VoxelPixels.of(edge, np.full(3, corner, np.float32), points, radiance, np.zeros(len(points), bool))
+    cache = voxels.cache(np.ones(len(points), bool))
+    return pool, cache, bright_triangles(total / np.maximum(count, 1)[:, None], count, limit), count
 
 
 def _descended(

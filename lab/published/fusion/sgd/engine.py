@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iif_core.fusion.kernels import IDENTITY
 from lab.published.adam import adam_factors
 from lab.published.fusion.hashgrid.texture import HashGridTexture
 from lab.published.fusion.sgd.options import SgdOptions
-from lab.published.fusion.sgd.pool import Pool, Step, runs, softmax, start_values
+from lab.published.fusion.sgd.pool import IDENTITY, Pool, Step, runs, softmax, start_values
 
 if TYPE_CHECKING:
     from lab.published.fusion.sgd.kernels import LossSettings

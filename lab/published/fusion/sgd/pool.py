@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.errors import InputError
-from iif_core.fusion.kernels import as_floats, as_words
+from iif_core.fusion.kernels import as_words
 from iif_core.fusion.problem import LOWEST, FusionProblem, usable_pixels
+from iif_core.reflectance import material
 from lab.published.fusion.sgd.kernels import LOCATION, SCALE
 from lab.published.fusion.sgd.options import SgdOptions
 
@@ -19,6 +20,13 @@ _FULL_ANNEALS = 81  # multiplications of the temperature in the 8080 steps of th
 _HALVINGS = 4  # of the learning rate
 _MIN_TEMPERATURE = 1e-30  # 1 / tau is still a float32
 _CHUNK_PIXELS = 65536  # read at a time
+IDENTITY = np.float32(material.IDENTITY)
+"""The identity map."""
+
+
+def as_floats(values: NDArray) -> NDArray:
+    """Return words (`as_words`) as float32 numbers."""
+    return values.view(np.float16).astype(np.float32) if values.dtype == np.uint16 else values
 
 
 @dataclass(frozen=True)
