@@ -28,7 +28,9 @@ from workflow.decisions.record import PROVISIONAL, SETTLED, not_probed
 from workflow.registry import STAGES
 from workflow.report import pictures as pic
 from workflow.report.downloads import commands, downloads
-from workflow.report.page import content_hash, number, score_table
+from workflow.report.page import content_hash
+from workflow.report.scores import score_table
+from workflow.report.wording import number
 from workflow.runtime.timings import read_timings
 from workflow.scene.cached_light import SpecularLight, table_of
 from workflow.scene.normal_form import CaptureReader, CaptureWriter, Truth, View
