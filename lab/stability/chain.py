@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.store import ids_from_disk, prediction_numbers, rgb, split_rgb
+from workflow.priors.face_albedo import albedo_of_faces
 from workflow.registry import STAGES
 from workflow.runtime import device
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, CaptureWriter, View
 from workflow.settings.scene import SceneSettings
-from workflow.stages.prior import albedo_of_faces
 
 SOURCES = ("capture", "prior")
 FITTED = ("plan", "segmentation", "base", "emission", "shading", "second_look", "affines")

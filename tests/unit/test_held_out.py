@@ -42,13 +42,13 @@ def test_nothing_that_is_fitted_sees_a_held_out_photograph(tmp_path):
 
 
 def test_rays_of_pixels_next_to_a_hole_stay_in_their_middle():
+    from iif_core.camera.pixels import pixel_steps
     from workflow.scene.normal_form import View
-    from workflow.stages.render import _pixel_steps
 
     view = View(0, "a", 5, 4, 8.0, 8.0, 2.5, 2.0, np.eye(4))
     face = np.zeros((4, 5), np.int32)
     face[1, 1] = -1
-    plain, holed = _pixel_steps(view, face, False), _pixel_steps(view, face, True)
+    plain, holed = pixel_steps(view, face, False), pixel_steps(view, face, True)
     for one, each in zip(plain, holed, strict=True):
         assert one.shape == (3,) and each.shape == (20, 3) and np.abs(one).max() > 0
         still = (each == 0).all(1).reshape(4, 5)
