@@ -14,7 +14,7 @@ from iif_core.light.relighting import coloured, sum_of_lamps
 from iif_core.numerics.color import linear_from_srgb, luminance
 from tests.errors import misset, named, refused
 from tests.unit.test_relighting import lit
-from tests.unit.test_report import FakeJob, make_scene
+from tests.unit.test_report import make_scene, scene_of
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.files import read_exr, write_exr
 from workflow.artifacts.store import rgb, split_rgb
@@ -166,7 +166,7 @@ def toy(llvm, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def studio(toy):
-    return Studio.open(FakeJob("lamp_images", toy))
+    return Studio.open(scene_of(toy).job("lamp_images"))
 
 
 def plate(path, colour=(200, 30, 30), size=(0.8, 0.02, 0.8)):
