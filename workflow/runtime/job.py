@@ -44,7 +44,7 @@ def _namespace(value: Any) -> Any:
 class Planned:
     """Scenes as the workflow makes them: settings from their files, stages in results/, each of the fingerprint that is planned.
 
-    The laboratory has another class with these methods, for stages whose settings and inputs it changes on purpose.
+    A subclass takes them from elsewhere, for stages whose settings and inputs are changed on purpose.
     """
 
     def settings(self, scene: str, quality: str) -> dict[str, Any]:
