@@ -237,7 +237,7 @@ def test_ldr_with_unknown_response(tmp_path, llvm):
 def test_measured_response_is_used_as_it_is(tmp_path, llvm, monkeypatch):
     truth = response_curve("filmic").samples(1024)
     np.save(tmp_path / "crf.npy", truth)
-    monkeypatch.setitem(AFFINES, "response", SimpleNamespace(file=str(tmp_path / "crf.npy")))
+    monkeypatch.setitem(AFFINES, "response", {"file": str(tmp_path / "crf.npy")})
     build(tmp_path, views=3, size=24, samples=16, dynamic_range="ldr", curve="filmic")
     _run(tmp_path, "ldr", emission={"rows": 2000, "samples": 4}, shading={"samples": 4})
     table = opened(tmp_path, "affines").table("camera_response.parquet")
@@ -274,7 +274,6 @@ def test_dark_and_blinding_rooms_run_to_the_end(tmp_path, llvm, caplog, dynamic_
 
 def test_known_scale_of_a_lamp_and_of_a_patch(hdr):
     """One factor, stated: the light is multiplied by it and the albedos divided; what is unknown is refused before any work."""
-    from types import SimpleNamespace
 
     folder, room = hdr
     free = opened(folder, "affines").table("objects.parquet")
