@@ -98,3 +98,14 @@ def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> Array:
     pose = np.eye(4)
     pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(forward, right), forward, origin
     return pose
+
+
+def up_axis(world_from_camera: ArrayLike) -> Array:
+    """Return the world axis (3,) nearest to the mean upward direction of the cameras (V, 4, 4); z if they cancel out."""
+    mean = -np.asarray(world_from_camera, np.float64)[:, :3, 1].sum(0)
+    axis = np.zeros(3)
+    strongest = int(np.argmax(np.abs(mean)))
+    if abs(mean[strongest]) < 1e-6:
+        strongest, mean = 2, np.ones(3)
+    axis[strongest] = np.sign(mean[strongest])
+    return axis

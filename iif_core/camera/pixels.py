@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import minimum_filter
 
 from iif_core.camera.gains import CameraGains, radius_squared
+from iif_core.camera.pinhole import direction_derivatives
 from iif_core.camera.view import View
 from iif_core.surface.triangles import towards_viewer
 
@@ -86,6 +88,27 @@ def pixels_of_view(view: View, decoded: DecodedView, normals: np.ndarray, among:
         interior=interior.ravel()[hit],
         number=((hit + view.view_id * 0x9E3779B1) & 0xFFFFFFFF).astype(np.uint32),
     )
+
+
+def pixel_steps(view: View, face: np.ndarray, holes: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Compute how directions change from pixel to pixel, by which rays are spread over their pixels.
+
+    Behind holes of the mesh lie the directions that light the room, not what the camera would see, so pixels next to a miss have
+    step 0: their rays stay in the middle.
+
+    Args:
+        view: the camera.
+        face: (H, W) face that each pixel shows, -1 = miss.
+        holes: whether the mesh has large holes.
+
+    Returns:
+        Change of direction to the next pixel on the right and below, (3,) each; (H * W, 3) each with `holes`.
+    """
+    steps = direction_derivatives(view.fx, view.fy, view.world_from_camera)
+    if not holes:
+        return steps
+    whole = minimum_filter(face >= 0, 3, mode="nearest").reshape(-1, 1)
+    return steps[0] * whole, steps[1] * whole
 
 
 def pixel_gains(gains: CameraGains, number: int, view: View, index: np.ndarray) -> np.ndarray:

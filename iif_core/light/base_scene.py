@@ -54,6 +54,16 @@ class BaseScene:
         share = np.zeros(self.n_objects, np.float32) if self.transmittance is None else self.transmittance
         return np.append(share, np.float32(0.0))[self.object_id]  # the last for surface of no object, -1
 
+    def facing(self, eye: np.ndarray) -> np.ndarray:
+        """Return the side of each face (m,) on which `eye` (3,) is: +1 that of its normal, -1 behind it, 0 in its plane."""
+        first = self.vertices[self.faces[:, 0]].astype(np.float64)
+        return np.sign(np.einsum("ij,ij->i", self.normals, np.asarray(eye, np.float64) - first))
+
+    def seen_normals(self, face_id: np.ndarray, eye: np.ndarray) -> np.ndarray:
+        """Return the normals (H, W, 3) float32 of the faces `face_id` (H, W) on the side of `eye` (3,); 0 where that is -1."""
+        normals = self.normals * self.facing(eye)[:, None]
+        return np.where((face_id >= 0)[..., None], normals[face_id], 0).astype(np.float32)
+
     def with_gains(self, gain: np.ndarray) -> BaseScene:
         """Return the scene with the albedos of its objects multiplied by `gain` (n_objects, 3) and limited to 1."""
         cells, objects = self.cell_values.copy(), self.object_values.copy()

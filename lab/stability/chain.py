@@ -3,62 +3,24 @@
 from __future__ import annotations
 
 import importlib
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from workflow import settings as settings_module
-from workflow.artifacts import StageReader, StageWriter
+from lab.loose import Loose, changed, document_of
+from workflow.artifacts import StageReader
 from workflow.artifacts.store import ids_from_disk, prediction_numbers, rgb, split_rgb
-from workflow.registry import STAGES
-from workflow.runtime import device
-from workflow.runtime.job import Job
+from workflow.priors.face_albedo import albedo_of_faces
 from workflow.scene.normal_form import CaptureReader, CaptureWriter, View
-from workflow.settings.scene import SceneSettings
-from workflow.stages.prior import albedo_of_faces
 
 SOURCES = ("capture", "prior")
 FITTED = ("plan", "segmentation", "base", "emission", "shading", "second_look", "affines")
 """The stages that are run on a changed capture, in order."""
 _CHANNELS = ("albedo.R", "albedo.G", "albedo.B", "roughness", "metallic")
-
-
-class FreeJob(Job):
-    """A job whose settings are given and whose folders are not those of a scene; it checks no fingerprints."""
-
-    def __init__(self, stage: str, folder: Path, document: dict[str, Any], threads: int = 1):
-        # `Job.__init__` is not called, because it looks a scene up.
-        self.stage, self.scene, self.quality, self.threads = STAGES[stage], "free", "draft", threads
-        self.log = logging.getLogger(stage)
-        self.document, self._folder = document, folder
-        self.device = device.use(document["device"])
-        self._parts: dict[str, dict[str, float]] = {}
-        self._earlier = {"seconds": 0.0, "cpu_seconds": 0.0}
-        self._started = self._cpu_started = 0.0
-
-    @property
-    def fingerprint(self) -> str:
-        return "0" * 16
-
-    def read(self, stage: str) -> StageReader:
-        return StageReader(self._folder / stage, stage, self.scene)
-
-    @cached_property
-    def writer(self) -> StageWriter:
-        return StageWriter(self._folder / self.stage.name, _provenance(self.stage.name))
-
-    def progress(self, done: int, total: int, what: str) -> None:
-        """Say nothing: hundreds of small jobs run in one process."""
-
-
-def _provenance(stage: str) -> dict[str, Any]:
-    return {"scene": "free", "stage": stage, "fingerprint": "0" * 16}
 
 
 @dataclass(frozen=True)
@@ -92,7 +54,7 @@ class Capture:
 
     def with_settings(self, **sections: dict[str, Any]) -> Capture:
         """Return the same capture with some settings changed."""
-        return replace(self, document={**self.document, **{k: {**self.document[k], **v} for k, v in sections.items()}})
+        return replace(self, document=changed(self.document, sections))
 
 
 @dataclass(frozen=True)
@@ -121,15 +83,14 @@ class Result:
     documents: Mapping[str, Any]
 
 
-def document_of(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the whole settings tree of some settings over the defaults."""
-    return dict(settings_module.dump(SceneSettings.model_validate(settings)))
+def _open(folder: Path, stage: str) -> StageReader:
+    return Loose(folder, {}).open(stage)
 
 
 def run_stages(folder: Path, document: Mapping[str, Any], stages: tuple[str, ...], threads: int = 1) -> None:
     """Run stages one after the other in a folder that has what they read."""
     for stage in stages:
-        job = FreeJob(stage, folder, dict(document), threads)
+        job = Loose(folder, document).job(stage, threads)
         importlib.import_module(job.stage.module).run(job)
         job.writer.finish()
 
@@ -138,7 +99,7 @@ def make_capture(folder: Path, settings: dict[str, Any]) -> Capture:
     """Render a scene with ground truth and its predictions once, and hold them in memory."""
     document = document_of(settings)
     run_stages(folder, document, SOURCES)
-    capture = CaptureReader(StageReader(folder / "capture", "capture", "free"))
+    capture = CaptureReader(_open(folder, "capture"))
     photos = {view.name: capture.photo(view) for view in capture.used}
     surface = {view.name: capture.gbuffer(view) for view in capture}
     truths = {view.name: capture.truth(view) for view in capture}
@@ -166,13 +127,13 @@ def make_capture(folder: Path, settings: dict[str, Any]) -> Capture:
 
 def with_predictions(capture: Capture, folder: Path, **prior: Any) -> Capture:
     """Return a capture whose predictions were made with other settings of the prior, from the folder of `make_capture`."""
-    changed = capture.with_settings(prior=prior)
-    run_stages(folder, changed.document, ("prior",))
-    return replace(changed, maps=_predictions(CaptureReader(StageReader(folder / "capture", "capture", "free")), folder))
+    other = capture.with_settings(prior=prior)
+    run_stages(folder, other.document, ("prior",))
+    return replace(other, maps=_predictions(CaptureReader(_open(folder, "capture")), folder))
 
 
 def _predictions(capture: CaptureReader, folder: Path) -> dict[str, NDArray]:
-    prior, maps = StageReader(folder / "prior", "prior", "free"), {}
+    prior, maps = _open(folder, "prior"), {}
     for view in capture.used:
         channels = prior.exr(f"maps/{view.name}.exr")
         layers = [f"prior.{k:03d}" for k in prediction_numbers(channels)]
@@ -188,12 +149,12 @@ def run(capture: Capture, folder: Path) -> Result:
 
 
 def _write(capture: Capture, folder: Path) -> None:
-    writer = StageWriter(folder / "capture", _provenance("capture"))
+    free = Loose(folder, capture.document)
+    writer, prior = free.plant("capture"), free.plant("prior")
     form = CaptureWriter(writer)
     form.cameras(list(capture.views))
     form.mesh(capture.vertices, capture.faces, capture.instance, list(capture.names) or None, capture.emission)
     hdr = capture.facts["dynamic_range"] == "hdr"
-    prior = StageWriter(folder / "prior", _provenance("prior"))
     rows = []
     for view in capture.views:
         name = view.name
@@ -213,19 +174,16 @@ def _write(capture: Capture, folder: Path) -> None:
     view_id, k = np.array(rows, np.int32).T
     used = np.ones(len(rows), bool)
     prior.table("predictions.parquet", {"view_id": view_id, "k": k, "used": used, "reason": np.array([""] * len(rows), object)})
-    reader = CaptureReader(StageReader(folder / "capture", "capture", "free"))
+    reader = CaptureReader(free.open("capture"))
     prior.table("faces.parquet", albedo_of_faces(prior, reader, set(view_id.tolist())))
     prior.finish()
 
 
 def read(capture: Capture, folder: Path) -> Result:
     """Read what the stages wrote to a folder."""
-
-    def reader(stage: str) -> StageReader:
-        return StageReader(folder / stage, stage, "free")
-
-    affines, segmentation, emission = reader("affines"), reader("segmentation"), reader("emission")
-    base, shading = reader("base"), reader("shading")
+    affines, segmentation, emission, base, shading, plan = (
+        _open(folder, stage) for stage in ("affines", "segmentation", "emission", "base", "shading", "plan")
+    )
     maps, seen, texture, diffuse = {}, {}, {}, {}
     for view in capture.views:
         file = f"maps/{view.name}.exr"
@@ -238,7 +196,7 @@ def read(capture: Capture, folder: Path) -> Result:
     radiance = np.stack([emitters[f"radiance_{c}"] for c in "rgb"], 1).astype(np.float64)
     size = np.asarray(emitters["area_m2"], np.float64)
     outside = radiance[kept & ~area]
-    plans = [reader("plan").json("plan.json"), emission.json("emission.json")]
+    plans = [plan.json("plan.json"), emission.json("emission.json")]
     selection = base.table("selection.parquet")
     numbers = int(np.max(selection["k"], initial=0)) + 1
     weight = np.stack([selection[f"weight_{name}"] for name in ("albedo", "roughness", "metallic")], 1)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from light_room import AFFINES, EMISSION, SHADING, StubJob, build
+from light_room import AFFINES, EMISSION, SHADING, build, opened, run
 
 from lab.baselines import stage
 from workflow.scene.normal_form import CaptureReader
@@ -11,35 +11,27 @@ from workflow.stages import affines, emission, shading
 MODELS = ("base", "object_mean", "texture_average", "fipt", "iris")
 
 
-def _reader(folder, stage):
-    return StubJob("reader", folder, {}).read(stage)
-
-
 def _run(folder, dynamic_range, **changes):
-    common = {"capture": {"dynamic_range": dynamic_range}, "affines": AFFINES}
-    for name, module, own in (("emission", emission, EMISSION), ("shading", shading, SHADING)):
-        job = StubJob(name, folder, {**common, name: {**own, **changes.get(name, {})}})
-        module.run(job)
-        job.writer.finish()
+    settings = {name: {**own, **changes.get(name, {})} for name, own in (("emission", EMISSION), ("shading", SHADING))}
+    stages = {"emission": emission, "shading": shading}
+    run(folder, stages, capture={"dynamic_range": dynamic_range}, affines=AFFINES, **settings)
 
 
 def _fit(folder, dynamic_range, model, **settings):
-    common = {"capture": {"dynamic_range": dynamic_range}, "emission": EMISSION}
-    own = {"model": model, "solver": "direct", **settings}
-    job = StubJob("affines", folder, {**common, "affines": AFFINES | own})
-    (affines if model == "objects" else stage).run(job)
-    job.writer.finish()
-    return _reader(folder, "affines")
+    own = AFFINES | {"model": model, "solver": "direct", **settings}
+    stages = {"affines": affines if model == "objects" else stage}
+    run(folder, stages, capture={"dynamic_range": dynamic_range}, emission=EMISSION, affines=own)
+    return opened(folder, "affines")
 
 
 def _psnr(folder, room, names):
     """Of the albedo of some objects, over all views."""
     errors = []
-    capture, wanted = CaptureReader(_reader(folder, "capture")), [room.names.index(name) for name in names]
+    capture, wanted = CaptureReader(opened(folder, "capture")), [room.names.index(name) for name in names]
     for view in capture:
         _, face = capture.gbuffer(view)
         seen = (face >= 0) & np.isin(room.object_id[face], wanted)
-        maps = _reader(folder, "affines").exr(f"maps/{view.name}.exr")
+        maps = opened(folder, "affines").exr(f"maps/{view.name}.exr")
         errors.append((np.stack([maps[f"albedo.{c}"] for c in "RGB"], -1)[seen] - room.material[face[seen], :3]) ** 2)
     return -10 * np.log10(np.mean(np.concatenate(errors)))
 
@@ -66,7 +58,7 @@ def test_every_model_leaves_what_ours_leaves(ldr, model):
     read_by_others = {"light_scale", "history", "converged", "pixels", "residual", "response", "plan", "solver"}
     facts = set(reader.json("affines.json"))
     assert read_by_others - {"solver"} <= facts and read_by_others <= keys
-    cells, base = reader.table("cells.parquet"), _reader(folder, "base").table("cells.parquet")
+    cells, base = reader.table("cells.parquet"), opened(folder, "base").table("cells.parquet")
     np.testing.assert_array_equal(cells["cell_id"], base["cell_id"])
     values = np.stack([cells[name] for name in ("albedo_r", "albedo_g", "albedo_b", "roughness", "metallic")], 1)
     assert np.isfinite(values).all() and (values >= 0).all() and (values <= 1).all() and (values[:, 3] >= 0.02).all()
@@ -75,7 +67,7 @@ def test_every_model_leaves_what_ours_leaves(ldr, model):
 
 def test_what_is_given_is_left_alone(ldr):
     folder = ldr[0]
-    reader, base = _fit(folder, "ldr", "base"), _reader(folder, "base")
+    reader, base = _fit(folder, "ldr", "base"), opened(folder, "base")
     np.testing.assert_array_equal(reader.table("cells.parquet")["albedo_g"], base.table("cells.parquet")["albedo_g"])
     mine, theirs = reader.exr("maps/v001.exr"), base.exr("maps/v001.exr")
     for name in ("albedo.R", "roughness", "metallic"):
@@ -94,10 +86,10 @@ def test_texture_average_is_the_mean_of_the_photographs(ldr):
     folder = ldr[0]
     reader, capture, base = (
         _fit(folder, "ldr", "texture_average"),
-        CaptureReader(_reader(folder, "capture")),
-        _reader(folder, "base"),
+        CaptureReader(opened(folder, "capture")),
+        opened(folder, "base"),
     )
-    emission = _reader(folder, "emission")
+    emission = opened(folder, "emission")
     exposure, lamps = emission.json("emission.json")["exposure"], emission.table("emitters.parquet")
     shines = emission.table("emitter_faces.parquet")
     lit = shines["face_id"][np.isin(shines["emitter_id"], lamps["emitter_id"][lamps["kept"].astype(bool)])]
@@ -129,7 +121,7 @@ def test_free_cells_see_what_the_prior_does_not(tmp_path, llvm):
         psnr[model] = _psnr(tmp_path, room, walls)
     assert psnr["fipt"] > 20 and psnr["fipt"] > psnr["base"] + 2
     assert _psnr(tmp_path, room, ["metal"]) < 12
-    assert not _reader(tmp_path, "affines").has("camera_response.parquet")
+    assert not opened(tmp_path, "affines").has("camera_response.parquet")
 
 
 def test_both_solvers_and_same_bytes_twice(ldr):

@@ -18,7 +18,7 @@ from lab.published.state import keep_state
 from tests.errors import missing, refused
 from tests.workflow import crash
 from tests.workflow.faulty_disk import Disk
-from workflow.artifacts import StageReader, StageWriter, locks
+from workflow.artifacts import StageReader, StageWriter, locks, swap
 from workflow.artifacts import files as io
 from workflow.runtime import ending
 from workflow.stages import publish
@@ -78,7 +78,7 @@ MUTANTS = {
     ),
     "the earlier deliverable is removed first": (
         publish,
-        "_replace",
+        "replace",
         lambda temporary, target: (publish.shutil.rmtree(target, ignore_errors=True), os.rename(temporary, target)),
         "deliverable over an earlier one",
         "scenes/s of",
@@ -209,7 +209,7 @@ def test_a_note_of_a_part_that_was_changed_is_not_taken_over(tmp_path):
 def test_a_deliverable_that_was_set_aside_comes_back(tmp_path, monkeypatch):
     """Killed between the two renames of a run by hand, and then the disk is full: the earlier one is there again."""
     monkeypatch.chdir(tmp_path)
-    crash.FakeJob(crash.OLD).make()
+    crash.make_upstream(crash.OLD)
     crash.deliver(crash.OLD)
     before = crash.tree(Path("scenes"))
     os.rename("scenes/s", "scenes/.s.old")
@@ -219,7 +219,7 @@ def test_a_deliverable_that_was_set_aside_comes_back(tmp_path, monkeypatch):
     assert crash.tree(Path("scenes")) == before
     os.rename("scenes/s", "scenes/.s.old")
     Path("scenes/.s.old/scene.glb").write_bytes(b"damaged")
-    publish.bring_back(Path("scenes/s"))
+    swap.bring_back(Path("scenes/s"))
     assert not Path("scenes/s").exists()
 
 

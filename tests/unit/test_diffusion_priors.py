@@ -274,23 +274,6 @@ def test_key_exposure_at_its_ends():
 # ------------------------------------------------------------------------------------------------------------------- stage
 
 
-class Job:
-    """As much of a job as stage prior uses, writing to a real stage folder."""
-
-    def __init__(self, folder, prior, seed=0, fingerprint="0123"):
-        self.settings, self.seed, self.fingerprint = SimpleNamespace(prior=prior), seed, fingerprint
-        self.threads = 1
-        self.writer = StageWriter(folder, {"stage": "prior", "scene": "tiny", "fingerprint": fingerprint})
-        self.warnings = []
-        self.log = SimpleNamespace(warning=lambda *a: self.warnings.append(a[0] % a[1:]))
-
-    def read(self, _):
-        return None
-
-    def progress(self, *_):
-        pass
-
-
 @pytest.fixture
 def run(made, tmp_path, monkeypatch):
     """run(folder, views) -> (reader, names of the views that the model was asked for); `fail` kills it after so many."""
@@ -304,17 +287,16 @@ def run(made, tmp_path, monkeypatch):
             asked.append(view.name)
             return predict(view, *rest)
 
+        settings = namespace("rgbx", made["rgbx"], **{"samples": 2, "steps": 1} | keys)
+        writer = StageWriter(tmp_path / folder, {"stage": "prior", "scene": "tiny", "fingerprint": fingerprint})
         with monkeypatch.context() as patch:
-            patch.setattr(stage, "CaptureReader", lambda _: Capture(views))
             patch.setattr(rgbx, "predict", counted)
-            keys = {"samples": 2, "steps": 1} | keys
-            job = Job(tmp_path / folder, namespace("rgbx", made["rgbx"], **keys).prior, fingerprint=fingerprint)
             if fail is not None:
                 with pytest.raises(KeyboardInterrupt):
-                    stage.run(job)
+                    stage.write(writer, Capture(views), settings, 0)
                 return None, asked
-            stage.run(job)
-            job.writer.finish()
+            stage.write(writer, Capture(views), settings, 0)
+            writer.finish()
         return StageReader(tmp_path / folder, "prior", "tiny"), asked
 
     return go

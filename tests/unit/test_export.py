@@ -17,7 +17,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from iif_core.camera.pinhole import direction_derivatives, look_at, pixel_directions
+from iif_core.camera.pinhole import direction_derivatives, look_at, pixel_directions, up_axis
 from iif_core.light.base_scene import BaseScene, Light
 from iif_core.numerics.color import linear_from_srgb
 from iif_core.surface.atlas import nearest_covered, texel_values, unwrap
@@ -48,7 +48,7 @@ from workflow.exporters.glb import fitting_glb, glb_bytes, rotation_to_y
 from workflow.exporters.mitsuba_lobes import METAL
 from workflow.exporters.mitsuba_scene import mitsuba_files
 from workflow.exporters.normal_map import normal_picture
-from workflow.exporters.surface import SeenSurface, build_parts, seen_sides, up_axis
+from workflow.exporters.surface import SeenSurface, build_parts, seen_sides
 from workflow.exporters.usd import BASE_COLOR, SURFACE, usd_bytes
 from workflow.runtime import native
 from workflow.scene.normal_form import View

@@ -1,7 +1,6 @@
 """Relighting: camera paths, the inserted lamp, and the stage against the renderer and the superposition of light."""
 
 import json
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from iif_core.camera.pinhole import look_at
 from iif_core.light.environment import resample
 from iif_core.light.relighting import axes_of_map, camera_path, ease, exposure_for, frame_times, sphere_mesh
 from tests.errors import refused
-from tests.unit.test_report import FakeJob, make_scene
+from tests.unit.test_report import made, make_scene, scene_of
 from workflow.artifacts.files import read_exr, write_exr
 from workflow.artifacts.store import rgb, split_rgb
 from workflow.exporters.camera_files import environment_picture
@@ -123,12 +122,7 @@ def lit(root, *wanted, run=None):
     common = {"samples": 256, "max_bounces": 4, "denoise": False}
     entries = [Relighting(**{**common, **entry}).model_dump(mode="json") for entry in wanted]
     for stage, module in (("lamp_images", lamp_images), ("relight", relight)):
-        job = FakeJob(stage, root)
-        job.timed = lambda name: nullcontext()
-        job.document["relight"] = job.settings.relight = entries
-        job.settings.lamp_images, job.settings.relight_title = lamp_bases(entries), ""
-        module.run(job)
-        job.writer.finish()
+        job = made(scene_of(root, relight=entries, lamp_images=lamp_bases(entries)), stage, module)
         if run is not None:
             run.append(job)
     folder = root / "results/toy/relight"

@@ -14,20 +14,19 @@ from iif_core.light.relighting import coloured, sum_of_lamps
 from iif_core.numerics.color import linear_from_srgb, luminance
 from tests.errors import misset, named, refused
 from tests.unit.test_relighting import lit
-from tests.unit.test_report import FakeJob, make_scene
+from tests.unit.test_report import make_scene, scene_of
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.files import read_exr, write_exr
 from workflow.artifacts.store import rgb, split_rgb
 from workflow.exporters.atlas import TexturedPart
 from workflow.exporters.glb import glb_bytes
-from workflow.relighting import sheet, video, world
+from workflow.relighting import frames, sheet, video, world
 from workflow.relighting.inserts import light_of, load_insert, placed
 from workflow.relighting.inventory import Inventory, Lamp
 from workflow.relighting.tracing import Studio
 from workflow.settings import relight_files, relight_origin, relight_plans
 from workflow.settings.mesh_files import emissive_strengths
 from workflow.settings.relight import Relighting, key_of, lamp_bases, lamp_basis, recombines
-from workflow.stages import relight
 
 
 def entry(**more):
@@ -167,7 +166,7 @@ def toy(llvm, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def studio(toy):
-    return Studio.open(FakeJob("lamp_images", toy))
+    return Studio.open(scene_of(toy).job("lamp_images"))
 
 
 def plate(path, colour=(200, 30, 30), size=(0.8, 0.02, 0.8)):
@@ -542,7 +541,7 @@ def test_a_way_through_a_wall_is_named(toy):
 
 
 def test_nothing_is_rendered_before_everything_was_checked(toy, monkeypatch):
-    monkeypatch.setattr(relight, "trace_picture", lambda *_: pytest.fail("rendered although the second relighting is wrong"))
+    monkeypatch.setattr(frames, "trace_picture", lambda *_: pytest.fail("rendered although the second relighting is wrong"))
     for key, far in (("center", {"center": [0, 0, 70]}), ("path_to", {"center": [0, 0, 1], "path_to": [0, 0, 70]})):
         with refused(f"relight.sphere.{key}", "b", "[0.0, 0.0, 70.0]"):
             lit(toy, {"name": "a", "method": "path"}, {"name": "b", "sphere": far})
@@ -555,10 +554,8 @@ def test_nothing_is_rendered_before_everything_was_checked(toy, monkeypatch):
 
 def test_frames_that_an_edit_does_not_touch_are_taken_over(toy, monkeypatch):
     traced = []
-    trace = relight.trace_picture
-    monkeypatch.setattr(
-        relight, "trace_picture", lambda *arguments: traced.append(arguments[4]["materials"]) or trace(*arguments)
-    )
+    trace = frames.trace_picture
+    monkeypatch.setattr(frames, "trace_picture", lambda *arguments: traced.append(arguments[4]["materials"]) or trace(*arguments))
     first = {"name": "first", "materials": {"box": {"albedo": [1, 0, 0]}}, "samples": 2}
     second = {"name": "second", "materials": {"box": {"albedo": [0, 1, 0]}}, "samples": 2}
     pictures, folder = lit(toy, first, second)

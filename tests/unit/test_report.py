@@ -1,14 +1,10 @@
 """The last stages on a made-up scene: render, metrics, export, report and publish over artefacts written here."""
 
-import contextlib
-import functools
 import json
-import logging
 import os
 import re
 import shutil
 from html.parser import HTMLParser
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -17,18 +13,19 @@ import yaml
 
 from iif_core.camera.pinhole import direction_derivatives, look_at, pixel_directions
 from iif_core.surface.cells import grid_origin, voxel_indices
+from lab.loose import Loose, changed, document_of
 from tests.errors import refused
-from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.files import read_exr, read_parquet, sha256_of
 from workflow.artifacts.manifest import SCENE_SCHEMA
 from workflow.artifacts.store import ids_to_disk, rgb, split_rgb
 from workflow.artifacts.verify import damaged
 from workflow.decisions.record import PROVISIONAL, SETTLED, not_probed
-from workflow.registry import STAGES
 from workflow.report import pictures as pic
 from workflow.report.downloads import commands, downloads
-from workflow.report.page import content_hash, number, score_table
+from workflow.report.page import content_hash
+from workflow.report.scores import score_table
+from workflow.report.wording import number
 from workflow.runtime.timings import read_timings
 from workflow.scene.cached_light import SpecularLight, table_of
 from workflow.scene.normal_form import CaptureReader, CaptureWriter, Truth, View
@@ -44,41 +41,26 @@ LAMP = np.array([6.0, 5.0, 4.0])
 WIDTH, HEIGHT, K = 40, 32, 3
 
 
-class FakeJob:
-    """A job without settings files and fingerprints: what a stage may touch, over one folder."""
+def scene_of(root, written=None, **sections):
+    """The stages of the scene `toy` under a folder, with quick settings; `written`: the folder under which they are written."""
+    quick = {
+        "render": {"samples": 256, "denoise": False},
+        "export": {"max_faces_glb": 100_000, "texture_size": 256},
+        "report": {"views": 2, "credit": "by <nobody> & co"},
+        "room": {"lightmap_size": 64, "samples": 16, "denoise": False},
+        "seed": 3,
+        "device": os.environ.get("IIF_TEST_DEVICE", "cpu"),
+    }
+    document = changed(changed(document_of({"source": {"kind": "builtin", "scene": "tiny"}}), quick), sections)
+    return Loose(root / "results/toy", document, "toy", written and written / "results/toy")
 
-    quality, seed, threads, fingerprint = "draft", 3, 2, "0123456789abcdef"
 
-    def __init__(self, stage, root, scene="toy"):
-        self.scene, self.root = scene, root
-        self.stage = SimpleNamespace(name=stage, upstream=STAGES[stage].upstream)
-        self.settings = SimpleNamespace(
-            render=SimpleNamespace(samples=256, max_bounces=4, denoise=False),
-            export=SimpleNamespace(max_faces_glb=100_000, texture_size=256, max_mb=40.0, normal_map=False),
-            report=SimpleNamespace(views=2, credit="by <nobody> & co"),
-            room=SimpleNamespace(lightmap_size=64, texture_size=256, samples=16, max_bounces=3, denoise=False, max_mb=25.0),
-            metrics=SimpleNamespace(views="all", lpips_vgg=False),
-        )
-        self.document = {"seed": 3}
-        self.log = logging.getLogger("test")
-        self.readers = {}
-
-    @functools.cached_property
-    def writer(self):
-        facts = {"scene": self.scene, "stage": self.stage.name, "fingerprint": f"print of {self.stage.name}"}
-        return StageWriter(self.root / "results" / self.scene / self.stage.name, facts)
-
-    def read(self, stage):
-        assert stage in self.stage.upstream
-        if stage not in self.readers:
-            self.readers[stage] = StageReader(self.root / "results" / self.scene / stage, stage, self.scene)
-        return self.readers[stage]
-
-    def progress(self, done, total, what):
-        assert 0 <= done <= total and what
-
-    def timed(self, name):
-        return contextlib.nullcontext()
+def made(scene, name, stage):
+    """Run a stage; returns its job."""
+    job = scene.job(name, 2)
+    stage.run(job)
+    job.writer.finish()
+    return job
 
 
 def material_columns(values):
@@ -110,13 +92,14 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     geometry = build_geometry(vertices, faces, object_id)
     emitters = Emitters(geometry, radiance, lit.astype(np.int8))
 
-    job = FakeJob("capture", root)
-    writer = CaptureWriter(job.writer)
+    scene = scene_of(root)
+    writer = scene.plant("capture")
+    form = CaptureWriter(writer)
     poses = [look_at([0.3, 0.3, 1.6], [2.2, 1.3, 0.8], [0, 0, 1]), look_at([2.7, 0.4, 1.4], [0.8, 1.4, 1.9], [0, 0, 1])]
     centre = (WIDTH / 2, HEIGHT / 2)
     views = [View(i, f"v{i}", WIDTH, HEIGHT, 30.0, 30.0, *centre, pose, 0.5 + 0.5 * i) for i, pose in enumerate(poses)]
-    writer.cameras(views)
-    writer.mesh(vertices, faces, object_id, ["walls", "box", "lamp"], radiance)
+    form.cameras(views)
+    form.mesh(vertices, faces, object_id, ["walls", "box", "lamp"], radiance)
     seen = []
     for view in views:
         eye = view.world_from_camera[:3, 3]
@@ -127,48 +110,47 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
         image = render(Scene(geometry, material, emitters), eye, rays, PathOptions(256, 4, 1), jitter).reshape(HEIGHT, WIDTH, 3)
         exposed = np.clip(view.exposure * image, 0, 1)
         photo = image if dynamic_range == "hdr" else exposed ** (1 / 2.2)
-        writer.photo(view.name, photo, np.ones((HEIGHT, WIDTH), bool), dynamic_range == "ldr")
-        writer.gbuffer(view.name, depth.reshape(HEIGHT, WIDTH), face.reshape(HEIGHT, WIDTH))
+        form.photo(view.name, photo, np.ones((HEIGHT, WIDTH), bool), dynamic_range == "ldr")
+        form.gbuffer(view.name, depth.reshape(HEIGHT, WIDTH), face.reshape(HEIGHT, WIDTH))
         values = TRUE[object_id[face]]
         maps = values.reshape(HEIGHT, WIDTH, 5)
         emission = np.where(lit[face][:, None], LAMP, 0).reshape(HEIGHT, WIDTH, 3)
         valid = np.ones((HEIGHT, WIDTH), bool)
         if truth:
-            writer.truth(view.name, Truth(maps[..., :3], maps[..., 3], maps[..., 4], emission, image, valid))
+            form.truth(view.name, Truth(maps[..., :3], maps[..., 3], maps[..., 4], emission, image, valid))
         seen.append((view, eye + depth[:, None] * rays, object_id[face], values))
     curve = np.linspace(0, 1, 101) ** (1 / 2.2)
     samples = np.stack([curve] * 3) if truth and dynamic_range == "ldr" else None
-    writer.finish("made up", dynamic_range, truth, ["a note with <angle> brackets"], samples)
-    job.writer.finish()
+    form.finish("made up", dynamic_range, truth, ["a note with <angle> brackets"], samples)
+    writer.finish()
 
-    job = FakeJob("plan", root)
+    writer = scene.plant("plan")
     closed = not_probed("environment", False, "the mesh is closed", SETTLED)
     open_yet = [not_probed(name, True, "decided later", PROVISIONAL) for name in ("metallic", "vignetting")]
-    job.writer.json("plan.json", {"plan": [closed, *open_yet]})
-    job.writer.finish()
+    writer.json("plan.json", {"plan": [closed, *open_yet]})
+    writer.finish()
 
-    job = FakeJob("prior", root)
-    job.writer.provenance["settings"] = {"prior": {"kind": "simulated", "samples": K}}
+    writer = scene.plant("prior", settings={"prior": {"kind": "simulated", "samples": K}})
     for view, _, _, values in seen:
         channels = {}
         for k in range(K):
             spoilt = np.clip(values * rng.uniform(0.5, 1.2, 5) + rng.normal(0, 0.05, values.shape), 0, 1)
             channels |= material_channels(spoilt, (HEIGHT, WIDTH), f"prior.{k:03d}.")
-        job.writer.exr(f"maps/{view.name}.exr", channels)
-    job.writer.finish()
+        writer.exr(f"maps/{view.name}.exr", channels)
+    writer.finish()
 
-    job = FakeJob("segmentation", root)
+    writer = scene.plant("segmentation")
     ids = np.arange(3, dtype=np.int32)
-    job.writer.table("faces.parquet", {"face_id": np.arange(26), "object_id": object_id})
-    job.writer.table("objects.parquet", {"object_id": ids, "name": ["walls", "box", "lamp"]})
+    writer.table("faces.parquet", {"face_id": np.arange(26), "object_id": object_id})
+    writer.table("objects.parquet", {"object_id": ids, "name": ["walls", "box", "lamp"]})
     for view, _, objects, _ in seen:
         segment = (3 * view.view_id + objects).reshape(HEIGHT, WIDTH)
         channels = {"object.id": ids_to_disk(objects.reshape(HEIGHT, WIDTH)), "segment.id": ids_to_disk(segment)}
         channels["interior"] = np.ones((HEIGHT, WIDTH), np.float32)
-        job.writer.exr(f"maps/{view.name}.exr", channels)
-    job.writer.finish()
+        writer.exr(f"maps/{view.name}.exr", channels)
+    writer.finish()
 
-    job = FakeJob("base", root)
+    writer = scene.plant("base", fingerprint="print of base")
     edge = 0.1
     points = np.concatenate([p for _, p, _, _ in seen])
     owner = np.concatenate([o for _, _, o, _ in seen])
@@ -184,24 +166,24 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
         "object_id": cells[:, 3],
     }
     columns |= {c: centres[:, i] for i, c in enumerate("xyz")}
-    job.writer.table("cells.parquet", {**columns, **material_columns(base)})
+    writer.table("cells.parquet", {**columns, **material_columns(base)})
     counts = np.bincount(cells[:, 3], minlength=3)
-    job.writer.table("objects.parquet", {"object_id": ids, "cells": counts, **material_columns(TRUE * [0.8, 0.8, 0.8, 1, 1])})
+    writer.table("objects.parquet", {"object_id": ids, "cells": counts, **material_columns(TRUE * [0.8, 0.8, 0.8, 1, 1])})
     rows = {"segment_id": np.repeat(np.arange(6), K), "k": np.tile(np.arange(K), 6)}
-    job.writer.table("selection.parquet", {**rows, "weight_albedo": rng.uniform(0, 1, 6 * K)})
+    writer.table("selection.parquet", {**rows, "weight_albedo": rng.uniform(0, 1, 6 * K)})
     start = 0
     for view, p, _, values in seen:
         channels = {"cell.id": ids_to_disk(cell_of[start : start + len(p)].reshape(HEIGHT, WIDTH))}
         channels["coverage"] = np.ones((HEIGHT, WIDTH), np.float32)
         channels |= material_channels(values * [0.8, 0.8, 0.8, 1, 1], (HEIGHT, WIDTH))
-        job.writer.exr(f"maps/{view.name}.exr", channels)
+        writer.exr(f"maps/{view.name}.exr", channels)
         start += len(p)
     plan = [{"component": "metallic", "included": False, "measure": "median predicted metalness", "value": 0.02}]
     plan[0] |= {"threshold": 0.25, "reason": "no object looks like a <metal>"}
-    job.writer.json("base.json", {"cell_edge_m": edge, "origin": origin.tolist(), "plan": plan, "seen_once_share": 0.25})
-    job.writer.finish()
+    writer.json("base.json", {"cell_edge_m": edge, "origin": origin.tolist(), "plan": plan, "seen_once_share": 0.25})
+    writer.finish()
 
-    job = FakeJob("emission", root)
+    writer = scene.plant("emission")
     rows = {
         "emitter_id": np.array([0, 1]),
         "kind": ["area", "area"],
@@ -211,47 +193,47 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     rows |= {"side": np.array([1, 0]), "observations": np.array([40, 9]), "kept": np.array([True, False])}
     rows |= {f"radiance_{c}": np.array([LAMP[i] / 2, 0.01]) for i, c in enumerate("rgb")}
     rows |= {f"error_{c}": np.array([0.1, 0.1]) for c in "rgb"} | {"reason": ["", "below 1 % of the power"]}
-    job.writer.table("emitters.parquet", rows)
+    writer.table("emitters.parquet", rows)
     none = {name: np.zeros(0, np.float32) for name in ("gain_r", "gain_g", "gain_b", "transmittance")}
-    job.writer.table("object_gains.parquet", {"object_id": np.zeros(0, np.int32), **none})
-    job.writer.table("emitter_faces.parquet", {"face_id": np.array([24, 25]), "emitter_id": [0, 0], "side": [1, 1]})
+    writer.table("object_gains.parquet", {"object_id": np.zeros(0, np.int32), **none})
+    writer.table("emitter_faces.parquet", {"face_id": np.array([24, 25]), "emitter_id": [0, 0], "side": [1, 1]})
     exposure = [view.exposure for view, *_ in seen]
     gains = {"exposure": exposure, "gain": [[e] * 3 for e in exposure], "vignetting": [0.0, 0.0]}
     escape = {"primary": 0.0, "secondary": 0.0}
-    job.writer.json("emission.json", {"notes": ["a note on light"], "plan": [], "escape_share": escape, **gains})
-    job.writer.finish()
+    writer.json("emission.json", {"notes": ["a note on light"], "plan": [], "escape_share": escape, **gains})
+    writer.finish()
 
-    job = FakeJob("second_look", root)
-    job.writer.json("second_look.json", {"made": False, "reason": "planted"})
-    job.writer.finish()
+    writer = scene.plant("second_look")
+    writer.json("second_look.json", {"made": False, "reason": "planted"})
+    writer.finish()
 
-    job = FakeJob("shading", root)
+    writer = scene.plant("shading")
     for view, p, _, _ in seen:
         light = np.repeat(1 + 0.3 * p[:, :1], 3, 1).reshape(HEIGHT, WIDTH, 3).astype(np.float32)
         halves = (split_rgb(light, f"half{half}.diffuse") for half in range(2))
-        job.writer.exr(f"maps/{view.name}.exr", {name: value for half in halves for name, value in half.items()})
+        writer.exr(f"maps/{view.name}.exr", {name: value for half in halves for name, value in half.items()})
         dark = np.zeros((2, HEIGHT * WIDTH, 2, 3), np.float32)
-        job.writer.table(table_of(view), SpecularLight(np.arange(HEIGHT * WIDTH), dark, dark).columns())
-    job.writer.table("levels.parquet", {"level": np.arange(2, dtype=np.int32), "roughness": [0.02, 1.0]})
-    job.writer.json("shading.json", {"diffuse": {"cell_edge_m": 0.1}, "plan": []})
-    job.writer.finish()
+        writer.table(table_of(view), SpecularLight(np.arange(HEIGHT * WIDTH), dark, dark).columns())
+    writer.table("levels.parquet", {"level": np.arange(2, dtype=np.int32), "roughness": [0.02, 1.0]})
+    writer.json("shading.json", {"diffuse": {"cell_edge_m": 0.1}, "plan": []})
+    writer.finish()
 
-    job = FakeJob("affines", root)
+    writer = scene.plant("affines")
     gain = np.concatenate([np.eye(3) / 0.8, np.zeros((3, 1))], 1).ravel()
     tables = {"T_albedo": np.tile(gain, (3, 1)), "T_roughness": np.tile([1.0, 0.0], (3, 1))}
     tables["T_metallic"] = np.tile([1.0, 0.0], (3, 1))
-    job.writer.table("objects.parquet", {"object_id": ids, "name": ["walls", "box", "lamp"], **tables})
+    writer.table("objects.parquet", {"object_id": ids, "name": ["walls", "box", "lamp"], **tables})
     fitted = {"cell_id": np.arange(len(cells)), **material_columns(TRUE[cells[:, 3]])}
-    job.writer.table("cells.parquet", {**fitted, "uncertainty": np.full(len(cells), 0.02)})
-    job.writer.json("affines.json", {"light_scale": 2.0, "history": [3.0, 2.0], "converged": False})
+    writer.table("cells.parquet", {**fitted, "uncertainty": np.full(len(cells), 0.02)})
+    writer.json("affines.json", {"light_scale": 2.0, "history": [3.0, 2.0], "converged": False})
     if dynamic_range == "ldr":
         n = np.repeat(["R", "G", "B"], 101)
         response = {"channel": n, "kind": ["sample"] * 303, "name": [""] * 303, "x": np.tile(np.linspace(0, 1, 101), 3)}
-        job.writer.table("camera_response.parquet", {**response, "value": np.tile(curve, 3)})
+        writer.table("camera_response.parquet", {**response, "value": np.tile(curve, 3)})
     for view, _, _, values in seen:
         channels = material_channels(values, (HEIGHT, WIDTH))
-        job.writer.exr(f"maps/{view.name}.exr", {**channels, "uncertainty": np.full((HEIGHT, WIDTH), 0.02, np.float32)})
-    job.writer.finish()
+        writer.exr(f"maps/{view.name}.exr", {**channels, "uncertainty": np.full((HEIGHT, WIDTH), 0.02, np.float32)})
+    writer.finish()
     benchmarks = root / "results/toy/benchmarks"
     benchmarks.mkdir(parents=True)
     measured = {"seconds": 12.5, "cpu_seconds": 20.25, "max_rss_mb": 300.5, "threads": 2}
@@ -273,9 +255,7 @@ def finish(root, upto="publish"):
         ("report", report),
         ("publish", publish),
     ):
-        job = FakeJob(name, root)
-        stage.run(job)
-        job.writer.finish()
+        made(scene_of(root), name, stage)
         if name == upto:
             return
 
@@ -294,7 +274,7 @@ def toy(llvm, tmp_path_factory):
 
 
 def test_recovered_scene(toy):
-    scene = read_recovered(FakeJob("publish", toy))
+    scene = read_recovered(scene_of(toy).job("publish"))
     assert scene.object_names == ["walls", "box", "lamp"]
     np.testing.assert_allclose(scene.emitter_radiance, [LAMP, [0, 0, 0]])  # light scale applied, dropped emitter is dark
     np.testing.assert_array_equal(np.flatnonzero(scene.emitter_id >= 0), [24, 25])
@@ -307,7 +287,7 @@ def test_recovered_scene(toy):
 
 
 def test_response_is_read_back(toy):
-    curve = read_response(FakeJob("publish", toy).read("affines"))
+    curve = read_response(scene_of(toy).open("affines"))
     np.testing.assert_allclose(curve(np.array([0.0, 0.5, 1.0])), [0, 0.5 ** (1 / 2.2), 1], atol=1e-3)
     assert curve(np.array([2.0, 2.0, 2.0]))[0] > 1.2  # continues as a straight line
 
@@ -353,11 +333,7 @@ def test_variants_and_gain(toy):
 def test_absent_weights_of_vgg_are_said(toy, tmp_path, monkeypatch, caplog):
     """Asked for and not there: the same scores without it, and one line that tells what to do."""
     monkeypatch.chdir(tmp_path)  # no results/weights here
-    job = FakeJob("metrics", tmp_path, "toy")
-    job.readers = {stage: StageReader(toy / "results/toy" / stage, stage, "toy") for stage in job.stage.upstream}
-    job.settings.metrics.lpips_vgg = True
-    metrics.run(job)
-    job.writer.finish()
+    made(scene_of(toy, tmp_path, metrics={"lpips_vgg": True}), "metrics", metrics)
     found, without = (read_parquet(root / "results/toy/metrics/variants.parquet") for root in (tmp_path, toy))
     for name, column in without.items():
         np.testing.assert_array_equal(found[name], column)
@@ -368,11 +344,7 @@ def test_absent_weights_of_vgg_are_said(toy, tmp_path, monkeypatch, caplog):
 
 def test_some_views_stand_for_all(toy, tmp_path):
     """Each score of a chosen view is the one that it has among all views."""
-    job = FakeJob("metrics", tmp_path)
-    job.readers = {stage: StageReader(toy / "results/toy" / stage, stage, "toy") for stage in job.stage.upstream}
-    job.settings.metrics.views = 1
-    metrics.run(job)
-    job.writer.finish()
+    job = made(scene_of(toy, tmp_path, metrics={"views": 1}), "metrics", metrics)
     some, every = (pd.DataFrame(read_parquet(root / "results/toy/metrics/metrics.parquet")) for root in (tmp_path, toy))
     views = set(some.view) - {"all"}
     capture = CaptureReader(job.read("capture"))
@@ -387,8 +359,7 @@ def test_some_views_stand_for_all(toy, tmp_path):
 
 
 def test_object_mean_is_the_mean_of_the_predictions(toy):
-    job = FakeJob("metrics", toy / "again")
-    job.root = toy
+    job = scene_of(toy).job("metrics")
     capture = CaptureReader(job.read("capture"))
     means = PredictionMeans(job, capture.views)
     total, count = np.zeros(3), 0
@@ -432,7 +403,7 @@ def test_deliverable_is_complete_and_verifies(toy):
     )
     manifest = json.loads((scene / "manifest.json").read_text())
     assert set(manifest["files"]) == names - {"manifest.json"}
-    assert manifest["settings"] == {"seed": 3} and manifest["fingerprints"]["base"] == "print of base"
+    assert manifest["settings"]["seed"] == 3 and manifest["fingerprints"]["base"] == "print of base"
     assert not list((toy / "scenes").glob(".*"))
     assert list(damaged(toy)) == []
     emitters = read_parquet(scene / "emitters.parquet")
@@ -452,7 +423,7 @@ def test_damage_is_named(toy, tmp_path):
 def test_publishing_again_replaces(toy, monkeypatch):
     monkeypatch.chdir(toy)
     (toy / "scenes/toy/stray.txt").write_text("left by a user")
-    publish.run(FakeJob("publish", toy))
+    publish.run(scene_of(toy).job("publish"))
     assert not (toy / "scenes/toy/stray.txt").exists()
     assert not list((toy / "scenes").glob(".*"))
 
@@ -461,7 +432,7 @@ def test_failed_publication_leaves_the_old_one(toy, monkeypatch):
     monkeypatch.chdir(toy)
     monkeypatch.setattr(publish, "copy", lambda source, target: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
-        publish.run(FakeJob("publish", toy))
+        publish.run(scene_of(toy).job("publish"))
     assert (toy / "scenes/toy/manifest.json").is_file() and not list((toy / "scenes").glob(".*"))
 
 
@@ -479,7 +450,7 @@ def test_a_copy_that_differs_from_what_a_stage_wrote_is_not_published(toy, tmp_p
     with monkeypatch.context() as disk:
         disk.setattr(publish, "copy", harmful)
         with refused("scenes/.toy.tmp/objects.parquet", "affines", "results/toy/affines/objects.parquet"):
-            publish.run(FakeJob("publish", place))
+            publish.run(scene_of(place).job("publish"))
         assert (place / "scenes/toy/manifest.json").read_bytes() == before
 
 
@@ -708,9 +679,7 @@ def test_scene_without_truth(llvm, tmp_path, monkeypatch, dynamic_range):
 
 def test_stages_write_the_same_bytes_again(toy):
     for name, stage in (("render", render), ("export", export)):
-        job = FakeJob(name, toy)
-        job.writer = StageWriter(toy / "twice/results/toy" / name, {"stage": name, "fingerprint": ""})
-        stage.run(job)
+        job = made(scene_of(toy, toy / "twice"), name, stage)
         first = json.loads((toy / f"results/toy/{name}/manifest.json").read_text())["files"]
         assert {n: f["sha256"] for n, f in job.writer.files.items()} == {n: f["sha256"] for n, f in first.items()}
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 import os
 import random
 import sys
@@ -30,12 +29,13 @@ import numpy as np
 from iif_core.errors import InputError
 from lab.published.state import keep_state, kept_state
 from tests.workflow.faulty_disk import HOSTILE, Disk, Fault, lay_out, tree
-from workflow.artifacts import StageReader, StageWriter, sound, stamps
+from workflow.artifacts import StageReader, StageWriter, sound, stamps, swap
 from workflow.artifacts import files as io
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.manifest import MANIFEST, SCENE_SCHEMA
 from workflow.registry import STAGES
 from workflow.runtime.ending import CAUSES, of_the_machine
+from workflow.runtime.timings import read_timings
 from workflow.stages import publish
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -126,42 +126,34 @@ def stage_is_sound(wanted: dict[str, Tree], mark: str) -> str:
 # -- a deliverable ------------------------------------------------------------------------------------------------------------
 
 
-class FakeJob:
-    """What `publish` needs of a job."""
+def _facts(stage: str, mark: str) -> dict[str, Any]:
+    return {"scene": "s", "stage": stage, "quality": "draft", "fingerprint": mark, "inputs": {}}
 
-    def __init__(self, mark: str):
-        self.stage, self.scene, self.quality, self.fingerprint = STAGES["publish"], "s", "draft", mark
-        self.document, self.log = {"seed": int(mark, 16) % 97}, logging.getLogger("publish")
-        self.writer = StageWriter(Path("results/s/publish"), self._facts("publish"))
 
-    def _facts(self, stage: str) -> dict[str, Any]:
-        return {"scene": "s", "stage": stage, "quality": "draft", "fingerprint": self.fingerprint, "inputs": {}}
-
-    def read(self, stage: str) -> StageReader:
-        return StageReader(Path("results/s") / stage, stage, "s")
-
-    def make(self) -> None:
-        """Write the stages from which the deliverable is copied."""
-        chosen = {
-            "export": ["scene.glb", "export.json", "textures/base_color.png"],
-            "render": ["maps/000.exr"],
-            "report": ["report.html", "verdict.json", "plan.yaml"],
-            "room": ["room.html", "scene_unlit.glb"],
-            "metrics": ["metrics.parquet"],
-            "affines": ["objects.parquet"],
-        }
-        for stage in self.stage.upstream:
-            writer = StageWriter(Path("results/s") / stage, self._facts(stage))
-            for name in chosen.get(stage, ["facts.json"]):
-                writer.bytes(name, f"{stage} {name} {self.fingerprint}".encode() * 40)
-            writer.finish()
+def make_upstream(mark: str) -> None:
+    """Write the stages from which the deliverable is copied."""
+    chosen = {
+        "export": ["scene.glb", "export.json", "textures/base_color.png"],
+        "render": ["maps/000.exr"],
+        "report": ["report.html", "verdict.json", "plan.yaml"],
+        "room": ["room.html", "scene_unlit.glb"],
+        "metrics": ["metrics.parquet"],
+        "affines": ["objects.parquet"],
+    }
+    for stage in STAGES["publish"].upstream:
+        writer = StageWriter(Path("results/s") / stage, _facts(stage, mark))
+        for name in chosen.get(stage, ["facts.json"]):
+            writer.bytes(name, f"{stage} {name} {mark}".encode() * 40)
+        writer.finish()
 
 
 def deliver(mark: str) -> None:
-    """Publish the scene `s` of the working folder by hand, as far as `Job` and `run_stage` do it."""
-    job = FakeJob(mark)
-    publish.run(job)  # type: ignore[arg-type]
-    job.writer.finish()
+    """Publish the scene `s` of the working folder, as stage publish does it."""
+    readers = {stage: StageReader(Path("results/s") / stage, stage, "s") for stage in STAGES["publish"].upstream}
+    writer = StageWriter(Path("results/s/publish"), _facts("publish", mark))
+    facts = {"scene": "s", "quality": "draft", "fingerprint": mark, "settings": {"seed": int(mark, 16) % 97}}
+    writer.json("published.json", publish.deliver(readers, facts, read_timings("s"))[0])
+    writer.finish()
 
 
 def of_deliverable(content: Tree) -> Tree:
@@ -174,7 +166,7 @@ def deliverable_is_sound(wanted: dict[str, Tree], mark: str) -> str:
     del mark
     folder = Path("scenes/s")
     if not folder.is_dir():
-        old = publish.set_aside(folder)
+        old = swap.set_aside(folder)
         if len(wanted) > 1 and not (
             old.is_dir() and not list(sound.wrong_files(old, manifests.read(old / MANIFEST, SCENE_SCHEMA)))
         ):
@@ -247,9 +239,9 @@ def _earlier(make: Callable[[str], None]) -> Callable[[], tuple[str, ...]]:
 def _upstream(*earlier: str) -> Callable[[], tuple[str, ...]]:
     def before() -> tuple[str, ...]:
         for mark in earlier:
-            FakeJob(mark).make()
+            make_upstream(mark)
             deliver(mark)
-        FakeJob(NEW).make()
+        make_upstream(NEW)
         return earlier
 
     return before

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import logging
+import os
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,11 @@ import numpy as np
 from iif_core.camera.pinhole import look_at, pixel_directions
 from iif_core.requirements.evidence import NOTHING
 from iif_core.surface.cells import grid_origin, pack_keys, unpack_keys, voxel_indices
+from lab.loose import Loose, changed, document_of
 from lab.simulated.photographs import response_curve
-from workflow.artifacts import StageReader, StageWriter
+from workflow.artifacts import StageReader
 from workflow.artifacts.store import ids_to_disk, split_rgb
 from workflow.decisions import plan as decisions
-from workflow.registry import STAGES
 from workflow.scene.normal_form import CaptureWriter, Truth, View
 
 SIZE = (4.0, 3.0, 2.4)
@@ -130,29 +130,28 @@ class Room:
         return out
 
 
-class StubJob:
-    """What a stage needs of a job, over a folder of the test's own."""
+def of(folder: Path, **sections: dict[str, Any]) -> Loose:
+    """The stages in a folder, with the usual settings and some changed."""
+    return Loose(folder, changed(_usual(), sections), "room")
 
-    quality, fingerprint = "draft", "0123456789abcdef"
 
-    def __init__(self, stage: str, folder: Path, settings: dict[str, Any], seed: int = 0):
-        self.stage, self.folder, self.seed, self.threads, self.scene = STAGES.get(stage), folder, seed, 2, "room"
-        self.document = {"seed": seed}
-        known = {"prior": {"kind": "simulated"}, "components": {"metallic": "auto"}, "materials": {}}
-        known |= {"segmentation": {"kind": "given"}} | settings
-        self.settings = SimpleNamespace(**{k: SimpleNamespace(**v) for k, v in known.items()})
-        self.log = logging.getLogger(stage)
-        provenance = {"scene": "room", "stage": stage, "fingerprint": "test"}
-        self.writer = StageWriter(folder / stage, provenance)
+@lru_cache(None)
+def _usual() -> dict[str, Any]:
+    document = document_of({"source": {"kind": "builtin", "scene": "tiny"}, "device": os.environ.get("IIF_TEST_DEVICE", "cpu")})
+    return changed(document, {"prior": {"kind": "simulated"}, "segmentation": {"kind": "given"}})
 
-    def read(self, stage: str) -> StageReader:
-        return StageReader(self.folder / stage, stage, "room")
 
-    def progress(self, done: int, total: int, what: str) -> None:
-        pass
+def run(folder: Path, stages: dict[str, ModuleType], **sections: dict[str, Any]) -> None:
+    """Run stages one after the other with the usual settings and some changed."""
+    for name, module in stages.items():
+        job = of(folder, **sections).job(name, 2)
+        module.run(job)
+        job.writer.finish()
 
-    def timed(self, name: str) -> AbstractContextManager[None]:
-        return nullcontext()
+
+def opened(folder: Path, stage: str) -> StageReader:
+    """The reader of a finished stage."""
+    return of(folder).open(stage)
 
 
 def build(
@@ -195,8 +194,8 @@ def build(
     material = FaceMaterials(room.material)
     emitters = Emitters(geometry, room.emission, room.side, environment=np.full(3, sky) if np.ndim(sky) == 0 else sky)
     sensor = response_curve(curve) if curve else None
-    capture = StubJob("capture", folder, {}).writer
-    segmentation = StubJob("segmentation", folder, {}).writer
+    capture = of(folder).plant("capture")
+    segmentation = of(folder).plant("segmentation")
     form = CaptureWriter(capture)
     form.cameras(cameras)
     form.mesh(room.vertices, room.faces, room.object_id, room.names, room.emission)
@@ -259,7 +258,7 @@ def _segments(view: View, objects: np.ndarray, room: Room) -> np.ndarray:
 
 def write_plan(folder: Path, specular: str = "on", environment: str = "auto") -> None:
     """Write a plan that leaves the light to stage emission; `specular: auto` leaves the lobes to the predictions."""
-    plan = StubJob("plan", folder, {}).writer
+    plan = of(folder).plant("plan")
     components = [
         decisions.environment(environment, 0.1, 0.1, 1.0, NOTHING),
         decisions.specular(specular, NOTHING),
@@ -281,7 +280,7 @@ def _spoil(room: Room, strength: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
-    base, prior = StubJob("base", folder, {}).writer, StubJob("prior", folder, {}).writer
+    base, prior = of(folder).plant("base"), of(folder).plant("prior")
     points = np.concatenate([p for _, p, _, _ in pixels])
     origin = grid_origin(room.vertices, CELL)
     objects = np.concatenate([o for _, _, o, _ in pixels])
@@ -334,7 +333,7 @@ def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
     facts = {"predictions": 1, "plan": [], "seen_once_share": 0.0}
     base.json("base.json", {**facts, "cell_edge_m": CELL, "origin": [float(v) for v in origin]})
     base.finish()
-    second_look = StubJob("second_look", folder, {}).writer
+    second_look = of(folder).plant("second_look")
     second_look.json("second_look.json", {"made": False, "reason": "planted"})
     second_look.finish()
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, SIZE, Room, StubJob, _box, _join, _quad, build
+from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, SIZE, Room, _box, _join, _quad, build, opened, run
 
 from iif_core.camera.pinhole import look_at
 from iif_core.light.environment import direction_in, solid_angles
@@ -32,19 +32,13 @@ def _run(folder, dynamic_range, upto="metrics", pixels="all", **emission_setting
         "export": {"max_faces_glb": 100_000, "texture_size": 256, "max_mb": 40.0, "normal_map": False},
         "report": {"views": 2, "credit": ""},
     }
-    for name, module in STAGES.items():
-        job = StubJob(name, folder, settings)
-        module.run(job)
-        job.writer.finish()
-        if name == upto:
-            return _checked(folder)
+    run(folder, dict(list(STAGES.items())[: list(STAGES).index(upto) + 1]), **settings)
+    return _checked(folder)
 
 
 def _checked(folder):
     """All that the stages wrote is finite (the reader refuses the rest) and in the ranges of docs/reference/artefacts.md."""
-    found = SimpleNamespace(
-        **{name: StubJob("reader", folder, {}).read(name) for name in ("capture", "base", *STAGES) if (folder / name).is_dir()}
-    )
+    found = SimpleNamespace(**{name: opened(folder, name) for name in ("capture", "base", *STAGES) if (folder / name).is_dir()})
     emitters = found.emission.table("emitters.parquet")
     for c in "rgb":
         assert (emitters[f"radiance_{c}"] >= 0).all() and (emitters[f"error_{c}"] >= 0).all()
@@ -167,10 +161,10 @@ def test_views_that_are_held_out(tmp_path, llvm, pixels):
     """No specular light is traced for them, and every stage still runs."""
     build(tmp_path, truth=True, views=4, size=24, samples=16, held_out=(1,))
     _run(tmp_path, "hdr", upto="report" if pixels == "all" else "metrics", pixels=pixels)
-    shading = StubJob("reader", tmp_path, {}).read("shading")
+    shading = opened(tmp_path, "shading")
     traced = [shading.rows(f"pixels/v{i:03d}.parquet") for i in range(4)]
     assert traced[1] == 0 and min(traced[:1] + traced[2:]) > 0
-    assert 0 < StubJob("reader", tmp_path, {}).read("affines").json("affines.json")["pixels"] <= sum(traced)
+    assert 0 < opened(tmp_path, "affines").json("affines.json")["pixels"] <= sum(traced)
 
 
 @pytest.mark.long

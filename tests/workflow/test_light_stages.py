@@ -8,13 +8,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, Room, StubJob, build, write_plan
+from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, Room, build, of, opened, run, write_plan
 
 from lab.simulated.photographs import response_curve
 from tests.errors import refused
 from workflow.artifacts import files
 from workflow.fitting import asked
-from workflow.registry import STAGES
 from workflow.scene import emission_views
 from workflow.scene.base_scene import read_base_scene
 from workflow.scene.cached_light import read_diffuse, read_specular
@@ -25,35 +24,24 @@ TRUE = np.array([[LAMP, 0.95 * LAMP, 0.85 * LAMP], [BULB, 0.8 * BULB, 0.6 * BULB
 
 
 def _run(folder, dynamic_range, upto="affines", **changes):
-    capture = {"dynamic_range": dynamic_range}
-    common = {"capture": capture, "emission": EMISSION, "affines": AFFINES}
-    for name, module, own in (
-        ("emission", emission, EMISSION),
-        ("shading", shading, SHADING),
-        ("affines", affines, {}),
-    ):
-        job = StubJob(name, folder, {**common, name: {**(own or AFFINES), **changes.get(name, {})}})
-        module.run(job)
-        job.writer.finish()
-        if name == upto:
-            return
-
-
-def _reader(folder, stage):
-    return StubJob("reader", folder, {}).read(stage)
+    stages = {"emission": emission, "shading": shading, "affines": affines}
+    settings = {"emission": EMISSION, "shading": SHADING, "affines": AFFINES}
+    settings = {name: {**own, **changes.get(name, {})} for name, own in settings.items()}
+    some = dict(list(stages.items())[: list(stages).index(upto) + 1])
+    run(folder, some, capture={"dynamic_range": dynamic_range}, **settings)
 
 
 def _emitters(folder):
-    table = _reader(folder, "emission").table("emitters.parquet")
+    table = opened(folder, "emission").table("emitters.parquet")
     return table, np.stack([table[f"radiance_{c}"] for c in "rgb"], 1)
 
 
 def _psnr(folder, room, stage, scaled=False):
     errors = []
-    for view in CaptureReader(_reader(folder, "capture")):
-        _, face = CaptureReader(_reader(folder, "capture")).gbuffer(view)
+    for view in CaptureReader(opened(folder, "capture")):
+        _, face = CaptureReader(opened(folder, "capture")).gbuffer(view)
         lit = (face >= 0) & ~room.emission.any(1)[face]
-        maps = _reader(folder, stage).exr(f"maps/{view.name}.exr")
+        maps = opened(folder, stage).exr(f"maps/{view.name}.exr")
         albedo, truth = np.stack([maps[f"albedo.{c}"] for c in "RGB"], -1)[lit], room.material[face[lit], :3]
         if scaled:
             albedo = albedo * (albedo * truth).sum(0) / (albedo**2).sum(0)
@@ -75,7 +63,7 @@ def test_hdr_emission_is_recovered(hdr):
     kept = np.flatnonzero(table["kept"])
     assert len(kept) == 2
     np.testing.assert_allclose(radiance[kept], TRUE, rtol=0.03)
-    faces = _reader(folder, "emission").table("emitter_faces.parquet")
+    faces = opened(folder, "emission").table("emitter_faces.parquet")
     assert set(faces["face_id"]) == set(np.flatnonzero(room.emission.any(1))) and (faces["side"] == 1).all()
 
 
@@ -95,8 +83,7 @@ def test_a_third_of_the_pixels_finds_the_same_light(hdr, tmp_path):
 def test_faces_between_the_chosen_pixels_are_seen(hdr):
     """No lamp may hide in a face that a photograph shows, though none of the pixels that are looked at lies on it."""
     folder, _ = hdr
-    job = StubJob("reader", folder, {"emission": EMISSION, "capture": {}, "affines": AFFINES})
-    job.stage = STAGES["emission"]
+    job = of(folder, capture={"dynamic_range": "hdr"}, emission=EMISSION, affines=AFFINES).job("emission")
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     records = emission_views.ViewRecords(job, capture, scene, 1000)
     of_pixels, seen = set(), set()
@@ -115,20 +102,17 @@ def test_without_lobes_no_path_is_traced_for_a_pixel(hdr, tmp_path):
     for stage in ("capture", "prior", "segmentation", "base", "emission", "second_look"):
         shutil.copytree(folder / stage, tmp_path / stage)
     write_plan(tmp_path, specular="off")
-    common = {"capture": {"dynamic_range": "hdr"}, "emission": EMISSION, "affines": AFFINES}
-    for name, module, own in (("shading", shading, SHADING), ("affines", affines, AFFINES)):
-        job = StubJob(name, tmp_path, {**common, name: own})
-        module.run(job)
-        job.writer.finish()
-    facts = _reader(tmp_path, "shading").json("shading.json")
+    settings = {"capture": {"dynamic_range": "hdr"}, "emission": EMISSION, "shading": SHADING, "affines": AFFINES}
+    run(tmp_path, {"shading": shading, "affines": affines}, **settings)
+    facts = opened(tmp_path, "shading").json("shading.json")
     assert facts["specular"] == {"pixels": 0}
     assert {item["component"]: item["status"] for item in facts["plan"]}["specular"] == "forced"
-    fitted = _reader(tmp_path, "affines").table("objects.parquet")
+    fitted = opened(tmp_path, "affines").table("objects.parquet")
     rough, metal = np.stack(fitted["T_roughness"]), np.stack(fitted["T_metallic"])
     assert (rough[:, 0] == 0).all() and (rough[:, 1] >= 0.85).all() and (metal == 0).all()
     assert _psnr(tmp_path, room, "affines") > _psnr(folder, room, "base") + 1
-    diffuse = read_diffuse(StubJob("reader", tmp_path, {}), CaptureReader(_reader(tmp_path, "capture")).views[0])
-    own = read_specular(StubJob("reader", tmp_path, {}), CaptureReader(_reader(tmp_path, "capture")).views[0])
+    job, view = of(tmp_path).job("affines"), CaptureReader(opened(tmp_path, "capture")).views[0]
+    diffuse, own = read_diffuse(job, view), read_specular(job, view)
     light = diffuse.reshape(2, -1, 3)[:, own.index]
     roughest = own.s0[:, :, -1] + own.s1[:, :, -1]
     lit = light.min(-1) > 0
@@ -141,7 +125,7 @@ def test_predictions_settle_the_lobes_where_the_photographs_left_them_open(hdr, 
     for stage in ("capture", "prior", "segmentation", "base", "emission", "second_look"):
         shutil.copytree(folder / stage, tmp_path / stage)
     write_plan(tmp_path, specular="auto")
-    job = StubJob("shading", tmp_path, {"shading": SHADING})
+    job = of(tmp_path, shading=SHADING).job("shading")
     scene = read_base_scene(job)
     values = scene.cell_values.copy()
     values[:, 3], values[:, 4] = roughness, 0
@@ -156,26 +140,26 @@ def test_hdr_albedo_comes_closer_to_the_truth(hdr):
 
 def test_tables_and_maps_are_complete(hdr):
     folder, room = hdr
-    fitted, base = (_reader(folder, stage).table("cells.parquet") for stage in ("affines", "base"))
+    fitted, base = (opened(folder, stage).table("cells.parquet") for stage in ("affines", "base"))
     np.testing.assert_array_equal(fitted["cell_id"], base["cell_id"])
-    objects = _reader(folder, "affines").table("objects.parquet")
+    objects = opened(folder, "affines").table("objects.parquet")
     assert objects["T_albedo"].shape == (len(room.names), 12) and (objects["std_albedo"] >= 0).all()
-    channels = _reader(folder, "shading").exr("maps/v000.exr")
+    channels = opened(folder, "shading").exr("maps/v000.exr")
     assert {f"half{h}.diffuse.{c}" for h in range(2) for c in "RGB"} == set(channels)
-    specular = _reader(folder, "shading").table("pixels/v000.parquet")
+    specular = opened(folder, "shading").table("pixels/v000.parquet")
     assert specular["half1_s0"].shape == specular["half0_s1"].shape == (len(specular["index"]), 30)
-    levels = _reader(folder, "shading").table("levels.parquet")["roughness"]
+    levels = opened(folder, "shading").table("levels.parquet")["roughness"]
     assert levels[0] == pytest.approx(0.02) and levels[-1] == 1 and (np.diff(levels) > 0).all()
-    facts = _reader(folder, "affines").json("affines.json")
+    facts = opened(folder, "affines").json("affines.json")
     # The level of linear photographs is known but for what a lamp in sight leaves open.
     assert facts["light_scale"] == pytest.approx(1, abs=1e-2)
     assert (np.diff(facts["history"]) <= 1e-9).all()
-    assert not _reader(folder, "affines").has("camera_response.parquet")
+    assert not opened(folder, "affines").has("camera_response.parquet")
 
 
 def test_halves_are_independent(hdr):
     """Same mean, uncorrelated noise."""
-    channels = _reader(hdr[0], "shading").exr("maps/v000.exr")
+    channels = opened(hdr[0], "shading").exr("maps/v000.exr")
     first, second = (channels[f"half{h}.diffuse.G"].ravel() for h in range(2))
     lit = (first > 0) & (second > 0)
     assert abs(np.log(first[lit].mean() / second[lit].mean())) < 0.05
@@ -185,15 +169,15 @@ def test_halves_are_independent(hdr):
 def test_specular_light_is_traced_where_the_fit_reads_it(hdr):
     """A draw of 600 pixels: no more are traced, evenly over the objects, and the fit has exactly these."""
     folder, _ = hdr
-    every = _reader(folder, "shading")
+    every = opened(folder, "shading")
     diffuse = every.exr("maps/v000.exr")["half0.diffuse.G"]
     try:
         _run(folder, "hdr", upto="affines", shading={"pixels": 600}, affines={**AFFINES, "pixels": 600})
-        drawn = _reader(folder, "shading")
+        drawn = opened(folder, "shading")
         count = sum(drawn.rows(name) for name in drawn.names("pixels/"))
         assert count == drawn.json("shading.json")["specular"]["pixels"] and 500 < count < 800
-        of_objects = _reader(folder, "affines").table("objects.parquet")["pixels"]
-        assert count == _reader(folder, "affines").json("affines.json")["pixels"] == of_objects.sum()
+        of_objects = opened(folder, "affines").table("objects.parquet")["pixels"]
+        assert count == opened(folder, "affines").json("affines.json")["pixels"] == of_objects.sum()
         largest = np.sort(of_objects)[-4:]
         assert largest.min() > 0.6 * largest.max()
         assert ((drawn.exr("maps/v000.exr")["half0.diffuse.G"] > 0) == (diffuse > 0)).all()
@@ -203,9 +187,9 @@ def test_specular_light_is_traced_where_the_fit_reads_it(hdr):
 
 def test_same_bytes_twice(hdr):
     folder, _ = hdr
-    before = {s: _reader(folder, s).manifest["files"] for s in ("emission", "shading", "affines")}
+    before = {s: opened(folder, s).manifest["files"] for s in ("emission", "shading", "affines")}
     _run(folder, "hdr")
-    assert before == {s: _reader(folder, s).manifest["files"] for s in before}
+    assert before == {s: opened(folder, s).manifest["files"] for s in before}
 
 
 def _emission_reading_files(folder, monkeypatch, budget):
@@ -220,7 +204,7 @@ def _emission_reading_files(folder, monkeypatch, budget):
         patch.setattr(files, "read_exr", counted)
         patch.setattr(emission_views, "VIEW_MEMORY_MB", budget)
         _run(folder, "ldr", upto="emission")
-    return {name: facts["sha256"] for name, facts in _reader(folder, "emission").manifest["files"].items()}, reads
+    return {name: facts["sha256"] for name, facts in opened(folder, "emission").manifest["files"].items()}, reads
 
 
 def test_each_view_is_decoded_once_within_the_memory_budget(tmp_path, llvm, monkeypatch):
@@ -241,11 +225,11 @@ def test_ldr_with_unknown_response(tmp_path, llvm):
     assert table["kept"].sum() == 2
     ratio = radiance[table["kept"]] / TRUE
     assert 0.6 < ratio.min() and ratio.max() < 1.4
-    error = _reader(tmp_path, "emission").json("emission.json")["level_error"]
+    error = opened(tmp_path, "emission").json("emission.json")["level_error"]
     assert 0.03 < error < 0.4 and abs(np.log(radiance[table["kept"]].sum() / TRUE.sum())) < 2 * error
     assert _psnr(tmp_path, room, "affines") > _psnr(tmp_path, room, "base") + 2.5
     assert _psnr(tmp_path, room, "affines", scaled=True) > _psnr(tmp_path, room, "base", scaled=True) + 1.5
-    response = _reader(tmp_path, "affines").table("camera_response.parquet")
+    response = opened(tmp_path, "affines").table("camera_response.parquet")
     samples = response["kind"] == "sample"
     assert samples.sum() == 303 and (np.diff(response["value"][samples][:101]) > 0).all()
 
@@ -253,16 +237,16 @@ def test_ldr_with_unknown_response(tmp_path, llvm):
 def test_measured_response_is_used_as_it_is(tmp_path, llvm, monkeypatch):
     truth = response_curve("filmic").samples(1024)
     np.save(tmp_path / "crf.npy", truth)
-    monkeypatch.setitem(AFFINES, "response", SimpleNamespace(file=str(tmp_path / "crf.npy")))
+    monkeypatch.setitem(AFFINES, "response", {"file": str(tmp_path / "crf.npy")})
     build(tmp_path, views=3, size=24, samples=16, dynamic_range="ldr", curve="filmic")
     _run(tmp_path, "ldr", emission={"rows": 2000, "samples": 4}, shading={"samples": 4})
-    table = _reader(tmp_path, "affines").table("camera_response.parquet")
+    table = opened(tmp_path, "affines").table("camera_response.parquet")
     assert set(table["kind"]) == {"sample"}
     x, value = table["x"].reshape(3, -1), table["value"].reshape(3, -1)
     np.testing.assert_allclose(
         value, [np.interp(a, np.linspace(0, 1, 1024), c) for a, c in zip(x, truth, strict=True)], atol=1e-6
     )
-    decision = _reader(tmp_path, "affines").json("affines.json")["plan"][0]
+    decision = opened(tmp_path, "affines").json("affines.json")["plan"][0]
     assert decision["component"] == "camera_response" and "crf.npy" in decision["reason"]
 
 
@@ -283,20 +267,19 @@ def test_dark_and_blinding_rooms_run_to_the_end(tmp_path, llvm, caplog, dynamic_
     table, radiance = _emitters(tmp_path)
     assert np.isfinite(radiance).all() and (radiance >= 0).all()
     if brightness == 0:
-        decisions = {d["component"]: d for d in _reader(tmp_path, "affines").json("affines.json")["plan"]}
+        decisions = {d["component"]: d for d in opened(tmp_path, "affines").json("affines.json")["plan"]}
         assert "fitted for 0 of 11 objects" in decisions["metallic"]["reason"] and not decisions["metallic"]["included"]
-        assert not table["kept"].any() and "no emitter" in " ".join(_reader(tmp_path, "emission").json("emission.json")["notes"])
+        assert not table["kept"].any() and "no emitter" in " ".join(opened(tmp_path, "emission").json("emission.json")["notes"])
 
 
 def test_known_scale_of_a_lamp_and_of_a_patch(hdr):
     """One factor, stated: the light is multiplied by it and the albedos divided; what is unknown is refused before any work."""
-    from types import SimpleNamespace
 
     folder, room = hdr
-    free = _reader(folder, "affines").table("objects.parquet")
+    free = opened(folder, "affines").table("objects.parquet")
     table, radiance = _emitters(folder)
     lamp = int(table["emitter_id"][np.flatnonzero(table["kept"])[0]])
-    job = StubJob("affines", folder, {"capture": {"dynamic_range": "hdr"}, "affines": AFFINES})
+    job = of(folder, capture={"dynamic_range": "hdr"}, affines=AFFINES).job("affines")
     reader = CaptureReader(job.read("capture"))
     known = SimpleNamespace(mean_albedo=None, white_patch=None, lamp=None)
 
@@ -326,10 +309,8 @@ PLANNED = {
 
 
 def _planned(folder):
-    job = StubJob("plan", folder, PLANNED)
-    plan.run(job)
-    job.writer.finish()
-    facts = _reader(folder, "plan").json("plan.json")
+    run(folder, {"plan": plan}, **PLANNED)
+    facts = opened(folder, "plan").json("plan.json")
     return {item["component"]: item for item in facts["plan"]}, facts["probes"]
 
 

@@ -4,14 +4,13 @@ import shutil
 
 import numpy as np
 import pytest
-from light_room import AFFINES, EMISSION, SHADING, StubJob, build
+from light_room import AFFINES, EMISSION, SHADING, build, of, opened, run
 
 from iif_core.fitting.predictions import PredictionErrors
 from workflow.artifacts.store import StageWriter
 from workflow.fitting.inputs import prediction_errors
 from workflow.scene.base_scene import SECOND_LOOK, read_base
 from workflow.scene.normal_form import CaptureReader
-from workflow.settings.base import Base
 from workflow.stages import base, second_look
 
 LEARNED = {"kind": "learned", "samples": 2, "device": "cpu"}
@@ -25,17 +24,14 @@ def lit(tmp_path_factory, llvm):
 
     folder = tmp_path_factory.mktemp("lit")
     room = build(folder, views=4, size=48, samples=64)
-    common = {"capture": {"dynamic_range": "hdr"}, "emission": EMISSION, "affines": AFFINES, "shading": SHADING}
-    for name, module in (("emission", emission), ("shading", shading)):
-        job = StubJob(name, folder, common)
-        module.run(job)
-        job.writer.finish()
+    settings = {"capture": {"dynamic_range": "hdr"}, "emission": EMISSION, "affines": AFFINES, "shading": SHADING}
+    run(folder, {"emission": emission, "shading": shading}, **settings)
     return folder, room
 
 
 def look(folder, prior=LEARNED, enabled=True):
     """Run the stage, and return its job."""
-    job = StubJob("second_look", folder, {"second_look": {"enabled": enabled}, "prior": prior, "base": Base().model_dump()})
+    job = of(folder, second_look={"enabled": enabled}, prior=prior).job("second_look")
     second_look.run(job)
     job.writer.finish()
     return job
@@ -51,26 +47,23 @@ def copied(lit, tmp_path):
 def test_without_a_second_look_the_first_base_is_read(lit, tmp_path, prior, enabled):
     folder = copied(lit, tmp_path)
     job = look(folder, prior, enabled)
-    assert (
-        set(job.writer.files) == {SECOND_LOOK}
-        and not StubJob("affines", folder, {}).read("second_look").json(SECOND_LOOK)["made"]
-    )
-    assert read_base(StubJob("affines", folder, {})).stage == "base"
+    assert set(job.writer.files) == {SECOND_LOOK} and not opened(folder, "second_look").json(SECOND_LOOK)["made"]
+    assert read_base(of(folder).job("affines")).stage == "base"
 
 
 def test_a_second_look_makes_a_base_of_the_same_cells_that_the_fit_and_all_after_it_read(lit, tmp_path):
     folder, room = copied(lit, tmp_path), lit[1]
-    first = StubJob("base", folder, {"prior": LEARNED, "base": Base().model_dump()})
+    first = of(folder, prior=LEARNED).job("base")
     base.fuse(first, _learned_without_light(folder))
     first.writer.finish()
     job = look(folder)
     views = CaptureReader(job.read("capture")).views
     assert set(job.writer.files) == MADE | {SECOND_LOOK} | {f"maps/{view.name}.exr" for view in views}
     for stage in ("affines", "render", "metrics", "export", "room", "report", "relight", "lamp_images"):
-        assert read_base(StubJob(stage, folder, {})).stage == "second_look", stage
+        assert read_base(of(folder).job(stage)).stage == "second_look", stage
     for stage in ("emission", "shading", "unwrap"):
-        assert read_base(StubJob(stage, folder, {})).stage == "base", stage
-    old, new = (StubJob("affines", folder, {}).read(stage).table("cells.parquet") for stage in ("base", "second_look"))
+        assert read_base(of(folder).job(stage)).stage == "base", stage
+    old, new = (opened(folder, stage).table("cells.parquet") for stage in ("base", "second_look"))
     for name in ("cell_id", "object_id", *"ijk", *"xyz"):
         assert np.array_equal(old[name], new[name]), name
     error = {}
@@ -99,9 +92,9 @@ def test_the_fit_is_told_that_the_second_base_errs_less(lit, tmp_path):
     prior.json("model.json", {"object_errors": stated})
     prior.finish()
     look(folder, enabled=False)
-    plain = prediction_errors(StubJob("affines", folder, {}))
+    plain = prediction_errors(of(folder).job("affines"))
     look(folder)
-    again = prediction_errors(StubJob("affines", folder, {}))
+    again = prediction_errors(of(folder).job("affines"))
     assert plain == PredictionErrors.from_facts(stated, "here")
     assert 0 < again.brightness < plain.brightness and again.level == plain.level and again.metal == plain.metal
 
@@ -109,7 +102,7 @@ def test_the_fit_is_told_that_the_second_base_errs_less(lit, tmp_path):
 def test_predictions_that_are_pooled_with_the_learned_ones_stay(lit, tmp_path):
     folder = copied(lit, tmp_path)
     writer = StageWriter(folder / "prior", {"scene": "room", "stage": "prior", "fingerprint": "test"})
-    views = CaptureReader(StubJob("base", folder, {}).read("capture")).views
+    views = CaptureReader(opened(folder, "capture")).views
     for view in views:
         plain = np.full((view.height, view.width), 0.25, np.float16)
         layers = [
@@ -124,11 +117,11 @@ def test_predictions_that_are_pooled_with_the_learned_ones_stay(lit, tmp_path):
     )
     writer.finish()
     other = {"kind": "files", "samples": 1}
-    job = StubJob("second_look", folder, {"prior": {"kind": "pooled", "samples": 8, "of": [other, LEARNED]}})
+    job = of(folder, prior={"kind": "pooled", "samples": 8, "of": [other, LEARNED]}).job("second_look")
     found = second_look._Predictions(job, CaptureReader(job.read("capture")))
     made = found.maps(views[0], 3)
     assert found.samples == 3 and np.allclose(made[0], 0.25)
-    alone = second_look._Predictions(StubJob("second_look", folder, {"prior": LEARNED}), CaptureReader(job.read("capture")))
+    alone = second_look._Predictions(of(folder, prior=LEARNED).job("second_look"), CaptureReader(job.read("capture")))
     assert np.array_equal(made[1:], alone.maps(views[0], 2)) and np.ptp(made[1].astype(float)) > 0.1
     assert np.array_equal(found.maps(views[0], 2), made[:2]) and np.array_equal(found.scale(views[0]), alone.scale(views[0]))
 
@@ -137,7 +130,7 @@ def _learned_without_light(folder):
     """Predictions of the first look."""
     from workflow.priors import learned
 
-    job = StubJob("prior", folder, {"prior": LEARNED})
+    job = of(folder, prior=LEARNED).job("prior")
     capture = CaptureReader(job.read("capture"))
     predict = learned.prepare(job.settings, capture, 0, lambda array: array)
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -243,6 +244,31 @@ def photographed(part: TexturedPart, recovered: Recovered) -> tuple[Array, Array
 
 
 # -------------------------------------------------------------------------------------------------------------- pictures
+
+
+def texture_facts(
+    parts: Sequence[TexturedPart], atlas: Atlas, unwrapped: Mapping[str, Any], table: Mapping[str, Array], size_in_glb: int
+) -> dict[str, Any]:
+    """Return what the textures lost: the sizes of a texel and of a surface cell in metres, and how much surface photographs show.
+
+    Args:
+        parts, atlas: of the scene.
+        unwrapped: unwrap.json; table: parts.parquet, both of stage unwrap.
+        size_in_glb: of the textures in scene.glb, which may be coarser than the atlas.
+    """
+    shown = [p for p, part in enumerate(parts) if part.emitter_id < 0]
+    density = np.asarray(table["texels_per_m"])[shown]
+    weight = density**2 * np.asarray(table["area_m2"])[shown]
+    order = np.argsort(density)
+    middle = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum()) if len(shown) else 0
+    texel = 1 / density[order][min(middle, len(shown) - 1)] if len(shown) else 0.0
+    return {
+        "atlas_size": unwrapped["size"],
+        "texel_m": texel,
+        "texel_in_glb_m": texel * unwrapped["size"] / size_in_glb,
+        "cell_m": unwrapped["cell_edge_m"],
+        "seen_share": float((atlas.seen & atlas.covered).sum() / max(atlas.covered.sum(), 1)),
+    }
 
 
 def base_color_picture(atlas: Atlas) -> Array:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from iif_core.light.environment import as_map, solid_angles
 from iif_core.numerics import color
 from workflow.exporters import blender_import
 from workflow.exporters.glb import rotation_to_y
@@ -138,6 +139,15 @@ def environment_picture(radiance: Array) -> Array:
     """Return a map (H, W, 3) of the light from outside as most programs have it, in the axes of the capture: z up, the middle
     column towards +x, columns to the right towards -y. Columns of `iif_core.light.environment` run from +x to +y."""
     return np.roll(radiance[:, ::-1], radiance.shape[1] // 2, axis=1)
+
+
+def environment_note(environment: Array) -> dict[str, Any] | None:
+    """Return the mean radiance of the light from outside, for programs and formats that have no map; None where it is dark."""
+    if not environment.any():
+        return None
+    radiance = as_map(environment)
+    mean = np.average(radiance, (0, 1), np.repeat(solid_angles(*radiance.shape[:2])[..., None], 3, -1))
+    return {"mean_radiance": [round(float(value), 6) for value in mean]}
 
 
 def photo_names(views: Iterable[View], is_hdr: bool) -> list[str]:

@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from iif_core.numerics import color
+from iif_core.reflectance.material import CHANNELS
+from workflow.scene.recovered import Recovered
 
 Array = np.ndarray
 
@@ -64,6 +66,17 @@ def object_rows(
     model = dict(zip(np.asarray(fit["object_id"]).tolist(), fit["model"], strict=True)) if "model" in fit else {}
     columns["model"] = [str(model.get(i, "")) for i in range(n)]
     return columns
+
+
+def recovered_objects(
+    recovered: Recovered, base: Mapping[str, Array], fit: Mapping[str, Array], seen: Mapping[str, Array]
+) -> dict[str, list]:
+    """Return the columns of objects.csv of a recovered scene, from objects.parquet of the base texture (`base`), of stage affines
+    (`fit`) and of stage segmentation (`seen`)."""
+    surface = recovered.surface
+    before = surface.object_values.astype(np.float64).copy()
+    before[base["object_id"]] = np.stack([base[name] for name in CHANNELS], 1)
+    return object_rows(recovered.object_names, surface.cell_object, surface.cell_values, surface.object_values, before, fit, seen)
 
 
 def hex_colour(linear: Array) -> str:

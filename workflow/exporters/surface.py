@@ -130,17 +130,6 @@ def seen_sides(vertices: Array, faces: Array, face_id: Array, eye: Array) -> tup
     return np.where(front, count, 0), np.where(front, 0, count)
 
 
-def up_axis(world_from_camera: Array) -> Array:
-    """Return the world axis (3,) nearest to the mean upward direction of the cameras (V, 4, 4); z if they cancel out."""
-    mean = -np.asarray(world_from_camera, np.float64)[:, :3, 1].sum(0)
-    axis = np.zeros(3)
-    strongest = int(np.argmax(np.abs(mean)))
-    if abs(mean[strongest]) < 1e-6:
-        strongest, mean = 2, np.ones(3)
-    axis[strongest] = np.sign(mean[strongest])
-    return axis
-
-
 # ----------------------------------------------------------------------------------------------------------- internals
 
 

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
-from workflow.exporters.surface import up_axis
 from workflow.models.denoise import denoise, require_denoiser
 from workflow.relighting.camera import Flight, check_way, plan_flight
 from workflow.relighting.inventory import Inventory, check_places
@@ -48,9 +47,7 @@ class Studio:
         """Read what stages before left; the job needs capture, segmentation, base, emission and affines upstream."""
         capture, room = CaptureReader(job.read("capture")), read_recovered(job)
         inventory = Inventory.read(job.read("segmentation"), job.read("emission"))
-        poses = np.stack([view.world_from_camera for view in capture.views])
-        up = np.asarray(capture.facts.get("up") or up_axis(poses), np.float64)
-        return Studio(job, capture, room, inventory, up / np.linalg.norm(up))
+        return Studio(job, capture, room, inventory, capture.up / np.linalg.norm(capture.up))
 
     def flight(self, entry: dict[str, Any]) -> Flight:
         """Return the frames of a dumped relighting, whose way is free.

@@ -1,6 +1,6 @@
 """Judges a result: four lights (geometry, light, materials, scale) with reasons and remedies, from what the stages measured.
 
-Everything here is pure. `workflow/stages/report.py` collects the `Evidence`; `LIMITS` holds every threshold, with its reason.
+Everything here is pure. `evidence.py` collects the `Evidence`; `LIMITS` holds every threshold, with its reason.
 """
 
 from __future__ import annotations

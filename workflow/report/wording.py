@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -15,6 +15,19 @@ FITTED = {
     "metal": "taken as metal",
 }
 """Text for parts of `model` of objects.parquet (`iif_core.fitting.selection`); other parts are text already."""
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """Format a value: three significant digits, yes or no, a dash for nothing."""
+    if value is None or value == "":
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}".replace(",", " ")
+    if isinstance(value, float):
+        return f"{value:.{digits}g}" if abs(value) < 1e5 else f"{value:.2e}"
+    return str(value)
 
 
 def percent(share: float, digits: int = 0) -> str:

@@ -41,8 +41,50 @@ def _namespace(value: Any) -> Any:
     return value
 
 
+class Planned:
+    """Scenes as the workflow makes them: settings from their files, stages in results/, each of the fingerprint that is planned.
+
+    A subclass takes them from elsewhere, for stages whose settings and inputs are changed on purpose.
+    """
+
+    def settings(self, scene: str, quality: str) -> dict[str, Any]:
+        """Return the whole settings tree of a scene, which the caller may change."""
+        return json.loads(fp.resolved(scene, quality))
+
+    def fingerprint(self, stage: str, scene: str, quality: str) -> str:
+        """Return what a stage is made as."""
+        return fp.fingerprint(stage, scene, quality)
+
+    def directory(self, stage: str, scene: str) -> Path:
+        """Return the folder that a stage writes."""
+        return stage_directory(scene, stage)
+
+    def reader(self, stage: str, scene: str, quality: str) -> StageReader:
+        """Return the reader of a finished stage.
+
+        Raises:
+            InputError: the stage is not there, or was built under other settings or code.
+        """
+        home = fp.home(stage, scene, quality)
+        reader = StageReader(stage_directory(home, stage), stage, home)
+        expected = fp.fingerprint(stage, scene, quality)
+        if reader.fingerprint != expected:
+            raise InputError(
+                f"{reader.directory / 'manifest.json'}: built as {reader.fingerprint}, needed {expected}"
+                f" (settings, inputs or code changed since). Run: snakemake --cores 2 scenes/{scene}"
+                f" --config quality={quality}"
+            )
+        return reader
+
+
 class Job:
     """What the `run(job)` of a stage receives.
+
+    Args:
+        stage: name of the stage; scene, quality: of which it is made.
+        threads: number of cores that it may use.
+        part: the part of the stage that it makes; None = all.
+        scenes: where settings and upstream stages come from.
 
     Attributes:
         name: of the job: the name of its stage, or such as `prior.3-of-8` if the job makes only a part.
@@ -54,11 +96,14 @@ class Job:
         log: logger of the job; `progress(done, total, what)` writes at most one line every five seconds.
     """
 
-    def __init__(self, stage: str, scene: str, quality: str, threads: int, part: Part | None = None):
+    def __init__(
+        self, stage: str, scene: str, quality: str, threads: int, part: Part | None = None, scenes: Planned | None = None
+    ):
+        self._scenes = scenes or Planned()
         self.name = f"{stage}.{part}" if part else stage
         self.stage, self.scene, self.quality, self.threads = STAGES[stage], scene, quality, threads
         self.log = logging.getLogger(f"{stage}")
-        self.document = json.loads(fp.resolved(scene, quality))
+        self.document = self._scenes.settings(scene, quality)
         self.device = device.use(self.document["device"])
         self._last_progress = self._started = time.monotonic()
         self._progress_of, self._first_item = "", (0, self._started)
@@ -87,7 +132,7 @@ class Job:
 
     @property
     def fingerprint(self) -> str:
-        return fp.fingerprint(self.stage.name, self.scene, self.quality)
+        return self._scenes.fingerprint(self.stage.name, self.scene, self.quality)
 
     def read(self, stage: str) -> StageReader:
         """Return the reader of an upstream stage.
@@ -111,22 +156,13 @@ class Job:
 
     def _reader(self, stage: str, of: str) -> StageReader:
         if (stage, of) not in self._readers:
-            scene = fp.home(stage, of, self.quality)
-            reader = StageReader(stage_directory(scene, stage), stage, scene)
-            expected = fp.fingerprint(stage, of, self.quality)
-            if reader.fingerprint != expected:
-                raise InputError(
-                    f"{reader.directory / 'manifest.json'}: built as {reader.fingerprint}, needed {expected}"
-                    f" (settings, inputs or code changed since). Run: snakemake --cores 2 scenes/{of}"
-                    f" --config quality={self.quality}"
-                )
-            self._readers[stage, of] = reader
+            self._readers[stage, of] = self._scenes.reader(stage, of, self.quality)
         return self._readers[stage, of]
 
     @cached_property
     def writer(self) -> StageWriter:
         """The writer of this stage's folder; it is finished after `run`."""
-        return StageWriter(stage_directory(self.scene, self.stage.name), self._provenance())
+        return StageWriter(self._scenes.directory(self.stage.name, self.scene), self._provenance())
 
     def _provenance(self) -> dict[str, Any]:
         readers = {stage: self.read(stage) for stage in self.stage.upstream}

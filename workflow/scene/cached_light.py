@@ -11,7 +11,7 @@ from iif_core.camera.pixels import ViewPixels
 from iif_core.errors import InputError
 from iif_core.light.shading import PixelLight
 from iif_core.surface.shading_cells import DiffuseShading, ShadingCells
-from workflow.artifacts.store import rgb, split_rgb
+from workflow.artifacts.store import StageReader, rgb, split_rgb
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import View
 
@@ -72,8 +72,17 @@ def read_specular(job: Job, view: View) -> SpecularLight:
 
 def has_lobes(job: Job) -> bool:
     """Return whether specular lobes were traced; without them, the light of a pixel is as if it came from everywhere alike."""
-    plan = job.read("shading").json("shading.json")["plan"]
-    return all(item["included"] for item in plan if item["component"] == "specular")
+    return _included(job.read("shading"), "specular")
+
+
+def ends_in_cache(shading: StageReader) -> bool:
+    """Return whether the paths of the cached light ended in photographed radiance."""
+    return _included(shading, "radiance_cache")
+
+
+def _included(shading: StageReader, component: str) -> bool:
+    plan = shading.json("shading.json")["plan"]
+    return all(item["included"] for item in plan if item["component"] == component)
 
 
 def read_diffuse(job: Job, view: View) -> np.ndarray:

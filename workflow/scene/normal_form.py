@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from iif_core.camera.pinhole import up_axis
 from iif_core.camera.view import View
 from workflow.artifacts.store import StageReader, StageWriter, ids_from_disk, ids_to_disk, rgb, split_rgb
 
@@ -162,6 +163,11 @@ class CaptureReader:
     @property
     def is_hdr(self) -> bool:
         return self.facts["dynamic_range"] == "hdr"
+
+    @property
+    def up(self) -> np.ndarray:
+        """(3,) direction that is up in the world: as the source says, or else the axis nearest to that of the cameras."""
+        return np.asarray(self.facts.get("up") or up_axis([view.world_from_camera for view in self.views]), np.float64)
 
     def __iter__(self) -> Iterator[View]:
         return iter(self.views)

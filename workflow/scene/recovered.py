@@ -40,9 +40,7 @@ class Recovered:
 
     def emission_map(self, face_id: np.ndarray, eye: np.ndarray) -> np.ndarray:
         """Return the radiance (H, W, 3) float32 that the faces `face_id` (H, W), -1 = miss, emit towards `eye` (3,)."""
-        first = self.surface.vertices[self.surface.faces[:, 0]].astype(np.float64)
-        facing = np.sign(np.einsum("ij,ij->i", self.surface.normals, np.asarray(eye, np.float64) - first))
-        emits = (self.light.side == 0) | (self.light.side == facing)
+        emits = (self.light.side == 0) | (self.light.side == self.surface.facing(eye))
         radiance = np.where(emits[:, None], self.light.radiance, 0)
         return np.where((face_id >= 0)[..., None], radiance[face_id], 0).astype(np.float32)
 

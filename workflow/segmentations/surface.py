@@ -31,6 +31,10 @@ class Objects:
     agreement: np.ndarray
     facts: dict[str, int | float]
 
+    def map_of(self, face_id: np.ndarray) -> np.ndarray:
+        """Return the object of each pixel, (H, W) int32, from its face (H, W); -1 where that is -1."""
+        return np.where(face_id >= 0, self.object_of_face[face_id], -1).astype(np.int32)
+
 
 @dataclass(frozen=True)
 class Stability:

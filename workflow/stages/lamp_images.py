@@ -5,18 +5,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from workflow.models.denoise import require_denoiser
 from workflow.relighting.camera import Flight
 from workflow.relighting.check import blamed_on_plan
+from workflow.relighting.lamp_files import lamp_channels
 from workflow.relighting.tracing import Studio, trace_lamps
 from workflow.relighting.world import World
 from workflow.runtime.job import Job
 from workflow.settings.relight import all_files_of, key_of, lamp_basis
-
-LARGEST_HALF = 6e4
-"""Radiance above which pictures are kept as single instead of half floats."""
 
 
 def run(job: Job) -> None:
@@ -50,11 +46,7 @@ def _trace(studio: Studio, basis: dict[str, Any], flight: Flight) -> dict[str, A
         if job.writer.part_kept(part, by) is not None:
             continue
         pictures = trace_lamps(world, flight, frame, basis, studio.seed(basis, frame))
-        dtype = np.float16 if pictures.max(initial=0.0) < LARGEST_HALF else np.float32
-        channels = {
-            channel(lamp, c): picture[..., i].astype(dtype) for lamp, picture in enumerate(pictures) for i, c in enumerate("RGB")
-        }
-        job.writer.exr(name, channels, "relative")
+        job.writer.exr(name, lamp_channels(pictures), "relative")
         job.writer.part_done(part, [name], {}, by)
     job.progress(frames, frames, f"frames of lamps, {key}")
     return {
@@ -65,8 +57,3 @@ def _trace(studio: Studio, basis: dict[str, Any], flight: Flight) -> dict[str, A
         "level": world.level.tolist(),
         "found": world.found.tolist(),
     }
-
-
-def channel(lamp: int, colour: str) -> str:
-    """Return the name of a channel: `lamp003.R`."""
-    return f"lamp{lamp:03d}.{colour}"

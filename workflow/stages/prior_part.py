@@ -20,4 +20,5 @@ def run(job: Job, number: int, count: int) -> None:
         count: of parts. Views are dealt out in turn, so that parts differ by one view at most.
     """
     capture = CaptureReader(job.read("capture"))
-    predicted(job, capture, capture.used[number - 1 :: count])
+    views = capture.used[number - 1 :: count]
+    predicted(job.writer, capture, views, job.settings, job.seed, job.threads, job.progress)

@@ -9,7 +9,6 @@ import numpy as np
 from iif_core.light.light_maps import to_half
 from workflow.exporters.atlas import bake, encoded, read_parts
 from workflow.exporters.glb import JPEG_QUALITY, glb_bytes
-from workflow.exporters.surface import up_axis
 from workflow.models.denoise import require_denoiser
 from workflow.room import build
 from workflow.room.contents import brightest, facts_of_objects, facts_of_part, page_that_fits, radiance_of_emitters
@@ -49,9 +48,8 @@ def run(job: Job) -> None:
             parts, texels, recovered.surface, lamps, *paths, lambda done, total: job.progress(done, total, "points lit")
         )
     halves = to_half(light)
-    poses = np.stack([view.world_from_camera for view in capture.views])
-    up = np.asarray(capture.facts.get("up") or up_axis(poses), np.float64)
-    frame = build.frame_of(parts, texels, up, poses[:, :3, 3])
+    eyes = np.stack([view.world_from_camera[:3, 3] for view in capture.views])
+    frame = build.frame_of(parts, texels, capture.up, eyes)
     geometry, places, bounds = build.geometry_blobs(parts, frame)
     blobs = geometry | build.light_blobs(halves, texels) | {"lobes": build.lobe_blob(), "colours": build.colour_blob()}
     blobs |= build.picture_blobs(atlas, TEXTURE_SIZE)
@@ -93,7 +91,7 @@ def run(job: Job) -> None:
     lit = unlit_picture(atlas, texels, total, exposure)
     provenance = {"scene": job.scene, "fingerprint": job.fingerprint, "exposure": exposure}
     shown = {"base_color": encoded(lit, JPEG_QUALITY)}
-    job.writer.bytes("scene_unlit.glb", glb_bytes(parts, shown, up, provenance, capture.views, exposure))
+    job.writer.bytes("scene_unlit.glb", glb_bytes(parts, shown, capture.up, provenance, capture.views, exposure))
     page, width = page_that_fits(job, capture, frame, document, blobs)
     job.writer.bytes("room.html", page)
     facts = {

@@ -1,0 +1,52 @@
+"""The table of emitters of the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from iif_core.numerics import color
+from workflow.report.wording import percent, significant
+
+
+def emitter_rows(table: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Return the rows of emitters.parquet of stage export as texts; the most powerful lamp first."""
+    radiance, error = (np.stack([table[f"{of}_{c}"] for c in "rgb"], 1).astype(np.float64) for of in ("radiance", "error"))
+    kept, area = table["kept"].astype(bool), table["kind"] == "area"
+    sides = np.where(table["side"] == 0, 2.0, 1.0)
+    power = np.where(kept & area, table["area_m2"] * sides, 0) * radiance.sum(1)
+    rows = []
+    for i in np.argsort(-power, kind="stable"):
+        peak = radiance[i].max()
+        swatch = color.to_uint8(color.srgb_from_linear(radiance[i] / peak if peak > 0 else radiance[i]))
+        rows.append(
+            {
+                "id": int(table["emitter_id"][i]),
+                "object": str(table["object"][i]),
+                "kind": str(table["kind"][i]),
+                "faces": int(table["faces"][i]),
+                "area": float(table["area_m2"][i]),
+                "radiance": ", ".join(significant(v) for v in radiance[i]),
+                "error": ", ".join(significant(v, 2) for v in error[i]),
+                "swatch": "#{:02x}{:02x}{:02x}".format(*swatch),
+                "share": percent(power[i] / power.sum(), 1) if area[i] and power.sum() > 0 else "–",
+                "power": f"{power[i]:.6g}",
+                "brightness": f"{radiance[i].sum():.6g}",
+                "observations": int(table["observations"][i]),
+                "kept": bool(kept[i]),
+                "reason": str(table["reason"][i]),
+            }
+        )
+    return rows
+
+
+def emitter_note(is_hdr: bool, light_scale: float) -> str:
+    """Say what the radiances are relative to. `light_scale`: factor on the light of stage emission that the fit found."""
+    text = "Radiance in the units of the photographs' exposure."
+    if not is_hdr:
+        text += " With LDR photographs the factor between light and albedo is `affines.scale`."
+    if light_scale != 1:
+        text += f" Light was multiplied by {light_scale:.3g} for that."
+    return text

@@ -1,0 +1,94 @@
+"""Collects what the stages measured, for the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from workflow.decisions import numerics
+from workflow.report.reported import Reported
+from workflow.report.scores import found
+from workflow.report.verdict import Evidence
+
+NUMERICS = ("base", "emission", "shading", "affines")
+"""Stages that say where their arithmetic came close to its end."""
+
+
+def evidence_of(scene: Reported) -> Evidence:
+    """Return what is known about a result."""
+    capture, recovered, means = scene.capture, scene.recovered, scene.summary["means"]
+    emission, affines = scene.document("emission"), scene.document("affines")
+    alignment, registration = capture.facts.get("alignment") or {}, capture.facts.get("registration") or {}
+    agreement = [view["agreement"] for view in registration.get("views", {}).values() if view.get("agreement")]
+    escape, scale = emission.get("escape_share") or {}, affines.get("scale") or {}
+    cache = [
+        decision["value"]
+        for decision in scene.document("shading").get("plan", [])
+        if decision["component"] == "radiance_cache" and "value" in decision
+    ]
+    emitters = scene.readers["export"].table("emitters.parquet")
+    fitted = scene.readers["affines"]
+    uncertainty = fitted.table("cells.parquet").get("uncertainty", ())
+
+    def psnr(quantity: str) -> float | None:
+        return found(means, quantity, "raw", "psnr").get("mean")
+
+    return Evidence(
+        escape=escape.get("secondary"),
+        escape_camera=escape.get("primary"),
+        depth=alignment.get("depth_median_disagreement"),
+        edges=alignment.get("edge_correlation"),
+        edges_warn=any("may not be aligned" in str(note) for note in capture.facts.get("notes", [])),
+        agreement=float(np.median(agreement)) if agreement else None,
+        photographs=len(capture.views),
+        lost=len(capture.facts.get("dropped_views") or ()) + len(capture.facts.get("left_out_views") or ()),
+        photographed=float(cache[-1]) if cache else scene.document("plan").get("probes", {}).get("photographed_share"),
+        stability=scene.document("segmentation").get("stability"),
+        lamps=int(np.count_nonzero(emitters["kept"].astype(bool) & (emitters["kind"] == "area"))),
+        environment=bool(np.any(recovered.light.environment)),
+        misfit=emission.get("misfit"),
+        light_spread=found(means, "rgb", "raw", "light_spread").get("mean"),
+        held_out=psnr("rgb_held_out"),
+        held_out_views=int(found(means, "rgb_held_out", "raw", "psnr").get("views", 0)),
+        used=psnr("rgb"),
+        albedo=psnr("albedo"),
+        roughness=psnr("roughness"),
+        metallic=psnr("metallic"),
+        roughness_interval=roughness_interval(scene.objects),
+        has_truth=capture.has_truth,
+        prior=str(scene.prior.get("kind", "")),
+        uncertainty=float(np.median(uncertainty)) if len(uncertainty) else None,
+        unfitted=unfitted_share(fitted.table("objects.parquet")),
+        level=str(scale.get("kind", "")),
+        level_error=scale.get("relative_error"),
+        raised=float(np.exp(emission.get("level_raised") or 0.0)),
+        light_scale=recovered.light_scale,
+        discrepancy=(affines.get("level_errors") or {}).get("normalised_discrepancy"),
+        warnings=[(stage, says) for stage in NUMERICS for says in numerics.warnings([(stage, scene.document(stage))])],
+    )
+
+
+def unfitted_share(objects: Mapping[str, np.ndarray]) -> float | None:
+    """Return the share of pixels on objects that were not fitted by themselves, from objects.parquet of stage affines; None where
+    it does not say."""
+    if "model" not in objects or "pixels" not in objects or not objects["pixels"].sum() > 0:
+        return None
+    alone = np.array([not str(model).startswith(("population", "identity")) for model in objects["model"]], bool)
+    return float(objects["pixels"][~alone].sum() / objects["pixels"].sum())
+
+
+def roughness_interval(objects: Sequence[Mapping[str, str]]) -> float | None:
+    """Return half of the 95 % interval of roughness, on its longer side, as the median over the pixels seen, from the rows of
+    objects.csv; None where less than half of the pixels are on objects that have one."""
+    width, pixels = [], []
+    for row in objects:
+        value, low, high = (float(row[f"roughness{end}"] or "inf") for end in ("", "_low", "_high"))
+        width.append(max(high - value, value - low))
+        pixels.append(float(row["pixels"] or 0))
+    if not sum(pixels):
+        return None
+    order = np.argsort(width, kind="stable")
+    share = np.cumsum(np.array(pixels)[order])
+    middle = width[order[np.searchsorted(share, 0.5 * share[-1])]]
+    return middle if np.isfinite(middle) else None
