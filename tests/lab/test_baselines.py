@@ -43,7 +43,9 @@ def plant(cells=120, objects=3, per_cell=6, seed=0, family="identity", params=No
         value, exposure = radiance, np.ones(n)
     else:
         value = np.minimum(curve(exposure[:, None] * radiance), 0.99)
-    rows = PixelRows(cell, np.ones(n), d, s0, s1, value, exposure, value >= 0.99)
+    rows = PixelRows(
+        cell=cell, weight=np.ones(n), diffuse=d, s0=s0, s1=s1, value=value, exposure=exposure, saturated=value >= 0.99
+    )
     return rows, object_id, objects, truth, curve
 
 
@@ -222,7 +224,9 @@ def test_extremes_are_finite_and_bounded():
     value[(cell >= 14) & (cell < 16)] = 1e9
     d[(cell >= 16) & (cell < 18)] = 1e-30
     cell[cell >= 55] = -1  # cells without pixels
-    broken = PixelRows(cell, rows.weight, d, s0, rows.s1, value, exposure, rows.saturated)
+    broken = PixelRows(
+        cell=cell, weight=rows.weight, diffuse=d, s0=s0, s1=rows.s1, value=value, exposure=exposure, saturated=rows.saturated
+    )
     problem = collect(broken, object_id, objects + 1, curve, dark=1e-6)  # and an object without cells
     for options in (FIPT, IRIS):
         prior = np.full((60, 3), 0.4) if options.prior else None

@@ -52,7 +52,7 @@ def test_each_file_is_read_once_if_memory_allows(memory, reads):
             for name, values in one.__dict__.items():
                 np.testing.assert_array_equal(values, getattr(other, name))
     assert (passes[0][1].value == 1).all() and (passes[0][0].object_id == 7).all() and len(passes[0][0].index) == 8
-    assert (decoded.segmented(views[0]).segment_id == 8).all()
+    assert (decoded.maps(views[0]).segment_id == 8).all()
 
 
 def test_what_fits_is_kept_and_the_rest_read_again():

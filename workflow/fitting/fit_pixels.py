@@ -23,7 +23,7 @@ def count_eligible(pixels: ViewPixels, mixed: np.ndarray, n_objects: int) -> np.
 
 
 def _eligible(pixels: ViewPixels, mixed: np.ndarray) -> np.ndarray:
-    return pixels.valid & (pixels.object_id >= 0) & ~mixed[pixels.face]
+    return pixels.valid & pixels.of_object & ~mixed[pixels.face]
 
 
 @dataclass(frozen=True)

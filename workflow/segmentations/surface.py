@@ -10,6 +10,7 @@ import numpy as np
 
 from iif_core.surface.segments import face_adjacency
 from workflow.artifacts.store import StageReader
+from workflow.scene.decoded import DecodedViews
 from workflow.scene.normal_form import CaptureReader, View
 
 FOLDS = 3  # perturbed runs; each leaves out every third photograph
@@ -50,11 +51,12 @@ class Stability:
 class Surface:
     """Mesh, photographs and, if they are there, predictions of a scene.
 
-    Costly properties are cached; plug-ins may cache results in `kept`.
+    Costly properties are cached; plug-ins may cache results in `kept`. `decoded` are the files of the capture.
     """
 
-    def __init__(self, capture: CaptureReader, prior: StageReader | None = None):
+    def __init__(self, capture: CaptureReader, prior: StageReader | None = None, decoded: DecodedViews | None = None):
         self.capture, self.prior = capture, prior
+        self.decoded = DecodedViews(capture) if decoded is None else decoded
         self.kept: dict[str, Any] = {}
         self.vertices, self.faces = capture.mesh()
 
@@ -73,7 +75,7 @@ class Surface:
         """Numbers of pixels that see each face, (m,) for every fold."""
         out = [np.zeros(len(self.faces), np.int64) for _ in range(FOLDS)]
         for i, view in enumerate(self.capture.used):
-            face = self.capture.gbuffer(view)[1]
+            face = self.decoded.gbuffer(view)[1]
             out[i % FOLDS] += np.bincount(face[face >= 0], minlength=len(self.faces))
         return out
 

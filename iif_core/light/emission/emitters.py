@@ -24,7 +24,7 @@ from iif_core.light.emission.environment import Sky, sky_prior
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, BaseAlbedo, GainOptions, ObjectGains
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.hidden import with_hidden_surface
-from iif_core.light.emission.photographs import SEEDS, Photographs, choose_rows, joined, radiance_cache, seen_faces
+from iif_core.light.emission.photographs import SEEDS, Photographs, choose_rows, radiance_cache, seen_faces
 from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import (
     EmissionProblem,
@@ -268,7 +268,7 @@ def _raised(
         first = first[np.argsort(drawn[first], kind="stable")[: -(-SATURATED_PIXELS // len(photos.views))]]
         parts.append(pixels.take(first))
         materials.append(record.base[first])
-    pixels, base = joined(parts), np.concatenate(materials)
+    pixels, base = ViewPixels.joined(parts), np.concatenate(materials)
     if not len(base):
         return cache
     transport = trace_rows(photos, pixels, base, found.groups, found.cache, sky, 2, unseen)
