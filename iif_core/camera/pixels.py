@@ -58,6 +58,7 @@ class ViewPixels(Rows):
         face, object_id: (n,) int32; from_front: (n,) bool, the camera is on the side of the face normal.
         value: (n, 3) photograph; valid, interior: (n,) bool.
         number: (n,) uint32 of view and pixel, by which rays that start there draw their random numbers.
+        base: (n, 5) float32 base albedo, roughness and metallic; None = nobody asked.
     """
 
     index: np.ndarray
@@ -71,6 +72,7 @@ class ViewPixels(Rows):
     valid: np.ndarray
     interior: np.ndarray
     number: np.ndarray
+    base: np.ndarray | None = None
 
     @property
     def of_object(self) -> np.ndarray:
@@ -78,13 +80,16 @@ class ViewPixels(Rows):
         return self.object_id >= 0
 
 
-def pixels_of_view(maps: ViewMaps, normals: np.ndarray, among: np.ndarray | None = None) -> ViewPixels:
+def pixels_of_view(
+    maps: ViewMaps, normals: np.ndarray, among: np.ndarray | None = None, base: np.ndarray | None = None
+) -> ViewPixels:
     """Collect the pixels of a view that hit the mesh.
 
     Args:
         maps: of the view, with objects and interior.
         normals: (m, 3) of the faces, 0 for degenerate ones.
         among: (H, W) bool, pixels that may be collected; None = all.
+        base: (H * W, 5) base albedo, roughness and metallic; None = nobody asks.
 
     Returns:
         One row for each pixel that hits the mesh.
@@ -108,6 +113,7 @@ def pixels_of_view(maps: ViewMaps, normals: np.ndarray, among: np.ndarray | None
         valid=maps.valid.ravel()[index] & np.isfinite(value).all(1),
         interior=maps.interior.ravel()[index],
         number=((index + view.view_id * 0x9E3779B1) & 0xFFFFFFFF).astype(np.uint32),
+        base=None if base is None else base[index],
     )
 
 

@@ -81,8 +81,8 @@ _MEDIAN_BINS, _MEDIAN_RANGE = 1024, (-10.0, 6.0)
 class Views(Protocol):
     """A sequence of views, which may read them when they are asked for.
 
-    Their `value` is radiance times the exposure of the camera, which is > 0, linear Rec. 709. Only pixels with surface are `valid`.
-    `object_id` is the object or piece of the mesh. There are `saturated` and `normals`, and the depth is 0 where there is no surface.
+    Their `value` is radiance times the exposure of the camera, which is > 0, linear Rec. 709. Only pixels with surface are valid.
+    `object_id` is the object or piece of the mesh. There are `saturated` and `normals`.
     """
 
     def __len__(self) -> int: ...
@@ -151,7 +151,7 @@ class SceneLight:
 
     def around(self, view: ViewMaps) -> tuple[NDArray, NDArray]:
         """Return rows of the cells around the n pixels of a view that show surface, and their weights, (n, k) each."""
-        hit = view.depth > 0
+        hit = view.hit
         return self.field.weights(view.points()[hit], view.normals[hit])
 
     def log_at(self, row: NDArray, weight: NDArray) -> NDArray:
@@ -225,7 +225,7 @@ def gather_views(
 
     def sums_of(i: int) -> tuple[NDArray, NDArray]:
         view = views[i]
-        index = _spread(view.depth)
+        index = _spread(view.hit)
         return view.object_id.ravel()[index], _reprojected(view, index, tables, cameras, neighbours[i])[2]
 
     for objects, sums in map_in_order(sums_of, len(views), threads):
@@ -275,7 +275,7 @@ def with_computed_light(gathering: Gathering, views: Views, irradiance: Iterable
     # -------- mean log light of each cell, over the pixels that are nearest to it --------
     total, count = np.zeros((cells, 3)), np.zeros(cells)
     for i, (own, picture) in enumerate(zip(gathering.lights, irradiance, strict=True)):
-        value = picture[views[i].depth > 0].astype(np.float64)
+        value = picture[views[i].hit].astype(np.float64)
         known = np.isfinite(value).all(1) & (value > 0).all(1)
         nearest = own.row[known, 0].astype(np.int64)  # rows are in the order of distance
         count += np.bincount(nearest, minlength=cells)
@@ -300,7 +300,7 @@ def _medians(views: Views, light: SceneLight, lights: list[ViewLight]) -> tuple[
     medians = _Medians()
     for i, own in enumerate(lights):
         view = views[i]
-        hit = view.depth > 0
+        hit = view.hit
         y = log_radiance(view)[hit] - light.log_at(own.row, own.weight)[0]
         medians.add(view.object_id[hit], y, (view.valid & ~view.saturated)[hit])
     return medians.group, medians.values()
@@ -314,7 +314,7 @@ def features(gathering: Gathering, views: Views, i: int) -> NDArray:
     """
     view = views[i]
     shape, n = view.depth.shape, view.depth.size
-    hit = np.flatnonzero(view.depth.ravel() > 0)
+    hit = np.flatnonzero(view.hit.ravel())
     own_log = log_radiance(view).reshape(n, 3)
     samples, count, sums = _reprojected(view, hit, gathering.tables, gathering.cameras, gathering.neighbours[i])
     own = gathering.tables[i]
@@ -400,7 +400,7 @@ def _cells(views: Views) -> tuple[SurfaceCells, float, list[NDArray]]:
     footprints, low, high = [], np.full(3, np.inf), np.full(3, -np.inf)
     for i in range(len(views)):
         view = views[i]
-        hit = view.depth > 0
+        hit = view.hit
         if hit.any():
             footprints.append(float(np.median(view.depth[hit])) / view.camera.fx)
             points = view.points()[hit]
@@ -418,7 +418,7 @@ def _cells(views: Views) -> tuple[SurfaceCells, float, list[NDArray]]:
         radiance = radiance_of(view)[use]
         builder.add(points[use], view.normals[use], view.object_id[use], radiance, view.saturated[use], view.camera.exposure)
         total, count = total + float(radiance.sum(dtype=np.float64)), count + radiance.size
-        where = np.floor((points[view.depth > 0] - low) / block).astype(np.int64)
+        where = np.floor((points[view.hit] - low) / block).astype(np.int64)
         seen.append(np.unique((where[:, 0] << 42) | (where[:, 1] << 21) | where[:, 2]))  # three indices of 21 bits
     return builder.finish(), max(total / max(count, 1), 1e-6), seen
 
@@ -436,7 +436,7 @@ def log_radiance(view: ViewMaps) -> NDArray:
 def _prepared(view: ViewMaps, light: SceneLight, trace: Trace) -> tuple[ViewTable, ViewLight]:
     """What other views look up in a view, and what only the view itself reads again."""
     n, cells = view.depth.size, light.cells
-    hit = np.flatnonzero(view.depth.ravel() > 0)
+    hit = np.flatnonzero(view.hit.ravel())
     points, normals = view.points().reshape(n, 3)[hit], view.normals.reshape(n, 3)[hit]
     # Mirrored rays, and the photographed radiance of the voxel that they meet.
     towards = -view.camera.directions().reshape(n, 3)[hit]
@@ -486,12 +486,12 @@ def _neighbours(seen: list[NDArray]) -> list[NDArray]:
     return out
 
 
-def _spread(depth: NDArray) -> NDArray:
+def _spread(hit: NDArray) -> NDArray:
     """Pixels that show surface, at most POOL_PIXELS or so: all, or every second, third, ... row and column."""
-    step = int(np.ceil(np.sqrt(depth.size / POOL_PIXELS)))
-    kept = np.zeros(depth.shape, bool)
+    step = int(np.ceil(np.sqrt(hit.size / POOL_PIXELS)))
+    kept = np.zeros(hit.shape, bool)
     kept[::step, ::step] = True
-    return np.flatnonzero((kept & (depth > 0)).ravel())
+    return np.flatnonzero(kept & hit)
 
 
 def _reprojected(

@@ -17,7 +17,7 @@ from iif_core.light.base_scene import BaseScene
 from workflow.artifacts.scratch import Joined
 from workflow.fitting.asked import Places, find_gauge, given_materials
 from workflow.fitting.cell_textures import CellTextures
-from workflow.fitting.fit_pixels import FitPixels, count_eligible
+from workflow.fitting.fit_pixels import PixelDraw, count_eligible
 from workflow.fitting.inputs import balanced, cells_of, exposure_and_balance, roughness_levels
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import base_maps, read_base, read_gains, read_lit_scene, sensor_bounds
@@ -26,7 +26,7 @@ from workflow.scene.decoded import DecodedViews
 from workflow.scene.named import object_names
 from workflow.scene.normal_form import CaptureReader
 
-Draw = Callable[[Job, DecodedViews, BaseScene, np.ndarray], FitPixels]
+Draw = Callable[[Job, DecodedViews, BaseScene, np.ndarray], PixelDraw]
 """Chooses the pixels of the fit, given the faces (m,) bool whose pixels are left out."""
 
 
@@ -90,16 +90,16 @@ def _starting_response(job: Job) -> tuple[Response, tuple[np.ndarray, np.ndarray
     return start, (start.params.ravel(), np.linalg.inv(np.asarray(known["covariance"], np.float64))), known
 
 
-def _drawn(job: Job, decoded: DecodedViews, scene: BaseScene, mixed: np.ndarray) -> FitPixels:
+def _drawn(job: Job, decoded: DecodedViews, scene: BaseScene, mixed: np.ndarray) -> PixelDraw:
     """Draw the pixels of the fit evenly over the objects (docs/method/fitting.md#which-pixels)."""
     asked, counts = job.settings.affines.pixels, np.zeros(max(scene.n_objects, 1), np.int64)
     for view in decoded.capture.used:
         counts += count_eligible(decoded.pixels(view, scene.normals), mixed, scene.n_objects)
-    return FitPixels.evenly(counts, int(counts.sum()) if asked == "all" else asked, mixed, job.seed)
+    return PixelDraw.evenly(counts, int(counts.sum()) if asked == "all" else asked, mixed, job.seed)
 
 
 def _problem(
-    job: Job, decoded: DecodedViews, scene: BaseScene, drawn: FitPixels, given: np.ndarray | None, merged: bool
+    job: Job, decoded: DecodedViews, scene: BaseScene, drawn: PixelDraw, given: np.ndarray | None, merged: bool
 ) -> tuple[FitProblem, Places]:
     """Read the pixels of the fit with their cached shading."""
     capture, views, gains = decoded.capture, decoded.capture.used, read_gains(job)

@@ -33,7 +33,7 @@ class Retinex:
         """Make K predictions of a view."""
         own = self.views.of(view)
         log_light = None
-        hit = (own.depth > 0).ravel()
+        hit = own.hit.ravel()
         if self.light is not None:
             log_light = np.zeros((len(REACHES), hit.size, 3))
             if hit.any():

@@ -137,7 +137,7 @@ class CaptureViews:
         for i in range(len(self)):
             own = self[i]
             pixels += own.depth.size
-            if (hit := own.depth > 0).any():
+            if (hit := own.hit).any():
                 footprints.append(float(np.median(own.depth[hit])) / own.camera.fx)
         corners = self.vertices[np.unique(self.faces)]
         extent = float(np.ptp(corners, axis=0).max())

@@ -150,9 +150,9 @@ def _part_and_join(
     code, fragment = np.unique(label.astype(np.int64) * pieces_in_all + piece, return_inverse=True)
 
     def pixels(view: View) -> tuple[np.ndarray, np.ndarray]:
-        labels, face = load(view), surface.decoded.gbuffer(view)[1]
-        masked = (face >= 0) & (labels > 0)
-        return fragment[face[masked]], labels[masked]
+        labels, maps = load(view), surface.decoded.maps(view, photograph=False)
+        masked = maps.hit & (labels > 0)
+        return fragment[maps.face[masked]], labels[masked]
 
     seen = sightings(pixels(view) for view in views)
     elected = code // pieces_in_all
@@ -167,8 +167,8 @@ def surface_points(surface: Surface, views: list[View], edge: float) -> np.ndarr
     keys, points = np.zeros(0, np.uint64), np.zeros((0, 3), np.float32)
     origin = grid_origin(surface.vertices, edge)
     for view in views:
-        depth = surface.decoded.gbuffer(view)[0]
-        here = view.points(depth)[depth > 0]
+        maps = surface.decoded.maps(view, photograph=False)
+        here = maps.points()[maps.hit]
         keys = np.concatenate([keys, pack_keys(voxel_indices(here, edge, origin))])
         keys, first = np.unique(keys, return_index=True)
         points = np.concatenate([points, here])[first]
@@ -179,21 +179,21 @@ def _footprint(decoded: DecodedViews, views: list[View]) -> float:
     """Return the median size of a pixel on the surface, in metres."""
     sizes = []
     for view in views:
-        depth = decoded.gbuffer(view)[0]
-        sizes.append(np.median(depth[depth > 0]) / view.fx)
+        maps = decoded.maps(view, photograph=False)
+        sizes.append(np.median(maps.depth[maps.hit]) / view.fx)
     return float(np.median(sizes))
 
 
 def _votes(surface: Surface, views: list[View], load: Load, masks: MaskPoints, cluster: np.ndarray, gap: float) -> list:
     origin, out = grid_origin(surface.vertices, gap), []
     for i, view in enumerate(views):
-        labels, (depth, face) = load(view), surface.decoded.gbuffer(view)
-        hit = face >= 0
+        labels, maps = load(view), surface.decoded.maps(view, photograph=False)
+        hit, face = maps.hit, maps.face
         table = np.full(max(int(labels.max()), 0) + 1, -1, np.int32)
         mine = masks.view == i
         table[masks.label[mine]] = cluster[mine]
         label = np.maximum(labels[hit], 0)
         of_pixel = table[label]
-        key = pack_keys(voxel_indices(view.points(depth)[hit], gap, origin), of_pixel)
+        key = pack_keys(voxel_indices(maps.points()[hit], gap, origin), of_pixel)
         out.append(view_votes(face[hit], key, of_pixel >= 0, label > 0, len(surface.faces)))
     return out

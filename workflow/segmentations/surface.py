@@ -75,8 +75,8 @@ class Surface:
         """Numbers of pixels that see each face, (m,) for every fold."""
         out = [np.zeros(len(self.faces), np.int64) for _ in range(FOLDS)]
         for i, view in enumerate(self.capture.used):
-            face = self.decoded.gbuffer(view)[1]
-            out[i % FOLDS] += np.bincount(face[face >= 0], minlength=len(self.faces))
+            maps = self.decoded.maps(view, photograph=False)
+            out[i % FOLDS] += np.bincount(maps.face[maps.hit], minlength=len(self.faces))
         return out
 
     def pixels(self, fold: int | None = None) -> np.ndarray:

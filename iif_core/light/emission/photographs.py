@@ -42,8 +42,7 @@ class ViewRecord:
     """Everything that is read of one view, decoded.
 
     Attributes:
-        pixels: the pixels that hit the mesh, n of them.
-        base: (n, 5) float32 base albedo, roughness and metallic of these pixels; empty for a held-out view.
+        pixels: the pixels that hit the mesh, with their base; without it for a held-out view.
         median_depth: metres, of the pixels with depth; None without any.
         counted: number of valid pixels of the whole photograph.
         escaping: (k,) flattened indices of the valid pixels that meet no surface.
@@ -53,7 +52,6 @@ class ViewRecord:
     """
 
     pixels: ViewPixels
-    base: np.ndarray
     median_depth: float | None
     counted: int
     escaping: np.ndarray
@@ -77,16 +75,15 @@ class ViewRecord:
         seen = None
         if among is not None:
             seen = np.unique(maps.face[maps.valid & maps.hit & np.isfinite(maps.value).all(-1)])
-        pixels = pixels_of_view(maps, normals, among)
+        pixels = pixels_of_view(maps, normals, among, base)
         values = maps.value.reshape(-1, 3)
         counted = (maps.valid if among is None else maps.valid & among).ravel()
         out = counted & np.isfinite(values).all(1)
         out[pixels.index] = False
         direction = maps.camera.directions().reshape(-1, 3)[out]
-        deep = maps.depth[maps.depth > 0]
+        deep = maps.depth[maps.hit]
         return cls(
             pixels=pixels,
-            base=np.zeros((0, 5), np.float32) if base is None else base[pixels.index],
             median_depth=np.median(deep) if deep.size else None,
             counted=int(counted.sum()),
             escaping=np.flatnonzero(out),
@@ -234,18 +231,17 @@ def seen_faces(photos: Photographs) -> np.ndarray:
 
 def choose_rows(
     photos: Photographs, groups: EmitterGroups, rest: float, thin: int = 1, tile_edge: int | None = None
-) -> tuple[ViewPixels, np.ndarray, EmissionPixels]:
+) -> tuple[ViewPixels, EmissionPixels]:
     """Draw the pixels of the linear system: a fixed number, evenly over views (one in `thin`), plus enough on every emitter.
 
     `rest` is the radiance from which surface may be an emitter; pixels of one object in a tile of `tile_edge`, None = `row_tile`,
-    will be averaged. Returns the pixels three times: as surface points, as base materials (n, 5), and as what they show.
+    will be averaged. Returns the pixels twice: as surface points, and as what they show.
     """
     elsewhere, per_view = (-(-photos.options.rows // (t * len(photos.views))) for t in (thin, 1))
     per_group = max(-(-ANCHOR_PIXELS // len(photos.views)), 4)
-    parts: list[tuple[ViewPixels, np.ndarray, EmissionPixels]] = []
+    parts: list[tuple[ViewPixels, EmissionPixels]] = []
     for view in photos.views:
-        record = photos.records[view]
-        pixels = record.pixels
+        pixels = photos.records[view].pixels
         group = groups.of_face[pixels.face]
         side = groups.side[pixels.face]
         dark_side = (group >= 0) & (side != 0) & ((side > 0) != pixels.from_front)
@@ -265,8 +261,8 @@ def choose_rows(
             group=group[choice],
             coverage=covered,
         )
-        parts.append((part, record.base[choice], rows))
-    pixels, base, rows = (list(part) for part in zip(*parts, strict=True))
+        parts.append((part, rows))
+    pixels, rows = (list(part) for part in zip(*parts, strict=True))
     every, shown = ViewPixels.joined(pixels), EmissionPixels.joined(rows)
     # Border pixels mix the emitter with its surroundings; they are used only for emitters that have no other pixels.
     group = shown.group
@@ -276,7 +272,7 @@ def choose_rows(
     whole = (group >= 0) & ~shown.partial & ~shown.bound.any(1)
     enough = np.bincount(group[whole & use], minlength=groups.size) >= photos.options.min_observations
     use &= ~(shown.partial & np.append(enough, False)[group])
-    return every.take(use), np.concatenate(base)[use], replace(shown.take(use), rest=rest)
+    return every.take(use), replace(shown.take(use), rest=rest)
 
 
 def _coverage(
