@@ -10,7 +10,10 @@ from iif_core.camera.pixels import ViewMaps
 from iif_core.camera.view import View
 from iif_core.surface.triangles import towards_viewer
 from workflow.artifacts.store import ids_to_disk
+from workflow.priors.views import CaptureViews
 from workflow.scene.decoded import DecodedViews, Kept
+from workflow.segmentations.geometry import mean_face_colour
+from workflow.segmentations.surface import Surface
 
 
 def _view(number, split="train"):
@@ -33,10 +36,33 @@ class Files:
         face[0] = -1
         return np.where(face >= 0, 2.0, 0.0).astype(np.float32), face
 
+    def given_instances(self, view):
+        return None
+
     def exr(self, name):
         self.reads["maps", name] += 1
         ids = self.objects
         return {"object.id": ids_to_disk(ids), "segment.id": ids_to_disk(ids + 1), "interior": np.ones((3, 4), np.float32)}
+
+
+class Room(Files):
+    """Photographs of a wall, without objects."""
+
+    is_hdr, facts = False, {}
+
+    def __init__(self):
+        super().__init__()
+        self.used = [_view(number) for number in range(4)]
+
+    def photo(self, view):
+        return np.full((3, 4, 3), 0.1 + 0.2 * super().photo(view)[0], np.float32), np.ones((3, 4), bool)
+
+    def mesh(self):
+        vertices = np.array([[-9, -9, 2], [9, -9, 2], [9, 9, 2], [-9, 9, 2]], np.float32)
+        return vertices, np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+
+    def faces(self):
+        return {"instance_id": np.full(2, -1, np.int32)}
 
 
 NORMALS = np.array([[0.0, 0.0, 1.0]])
@@ -117,6 +143,27 @@ def test_what_was_forgotten_is_made_again_and_its_memory_is_free():
     for name in "baba":
         kept.once(name, lambda name=name: make(name))
     assert made == {"a": 3, "b": 3}
+
+
+def test_colours_of_faces_and_those_of_perturbed_runs_are_of_one_reading():
+    files = Room()
+    surface = Surface(files)
+    colours = [mean_face_colour(surface, fold)[0][0, 0] for fold in (None, 0, 1, 2)]
+    shown = np.array([0.1, 0.3, 0.5, 0.7])
+    np.testing.assert_allclose(colours, [shown.mean(), 0.4, shown[[0, 2, 3]].mean(), shown[[0, 1, 3]].mean()], rtol=1e-6)
+    assert [len(surface.pixels_of_face), *surface.pixels()] == [3, 32, 0]
+    assert set(files.reads.values()) == {1} and len(files.reads) == 8
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_a_prior_of_all_photographs_decodes_each_once(factor):
+    files = Room()
+    views = CaptureViews(files, objects_given=True, factor=factor)
+    views.calibrate()
+    for _ in range(2):
+        for view in files.used:
+            assert views.of(view).hit.any() and views.full(view).valid.sum() == 8
+    assert set(files.reads.values()) == {1} and len(files.reads) == 8
 
 
 def test_normals_face_the_viewer_and_faces_without_area_get_his_direction():
