@@ -14,6 +14,8 @@ from workflow.scene.decoded import DecodedViews
 from workflow.scene.normal_form import CaptureReader, View
 
 FOLDS = 3  # perturbed runs; each leaves out every third photograph
+MEMORY_MB = 256.0
+"""Megabytes of decoded files that are kept: the memory of this stage is to stay small."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class Surface:
 
     def __init__(self, capture: CaptureReader, prior: StageReader | None = None, decoded: DecodedViews | None = None):
         self.capture, self.prior = capture, prior
-        self.decoded = DecodedViews(capture) if decoded is None else decoded
+        self.decoded = DecodedViews(capture, memory_mb=MEMORY_MB) if decoded is None else decoded
         self.kept: dict[str, Any] = {}
         self.vertices, self.faces = capture.mesh()
 
