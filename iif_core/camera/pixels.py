@@ -1,32 +1,57 @@
-"""The pixels of one photograph that show surface."""
+"""The pixels of one photograph: its maps, and the pixels that show surface."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import DTypeLike
 from scipy.ndimage import minimum_filter
 
 from iif_core.camera.gains import CameraGains, radius_squared
 from iif_core.camera.pinhole import direction_derivatives
 from iif_core.camera.view import View
+from iif_core.numerics.rows import Rows
 from iif_core.surface.triangles import towards_viewer
 
 
-class DecodedView(NamedTuple):
-    """Photograph, G-buffer and segmentation of a view as they are stored, (H, W) and (H, W, 3) arrays."""
+@dataclass(frozen=True, kw_only=True)
+class ViewMaps:
+    """A view as images, H rows and W columns. A map that nobody asked for, or that the scene does not have yet, is None.
 
-    photo: np.ndarray
+    Attributes:
+        camera: of the photograph.
+        value: (H, W, 3) the photograph: sensor values, or radiance. Whoever makes something else of it says so.
+        valid: (H, W) bool, pixels whose value may be used.
+        depth: (H, W) float32 z-depth in metres, 0 = no surface; face: (H, W) int32, -1 = no surface.
+        object_id, segment_id: (H, W) int32, -1 = none; interior: (H, W) bool, away from the borders of objects.
+        saturated: (H, W) bool, `value` is a lower bound.
+        normals: (H, W, 3) float32 unit normals towards the camera, 0 = no surface.
+    """
+
+    camera: View
+    value: np.ndarray
     valid: np.ndarray
     depth: np.ndarray
     face: np.ndarray
-    object_id: np.ndarray
-    interior: np.ndarray
+    object_id: np.ndarray | None = None
+    segment_id: np.ndarray | None = None
+    interior: np.ndarray | None = None
+    saturated: np.ndarray | None = None
+    normals: np.ndarray | None = None
+
+    @property
+    def hit(self) -> np.ndarray:
+        """(H, W) bool: the pixel hits the mesh."""
+        return (self.face >= 0) & (self.depth > 0)
+
+    def points(self, kind: DTypeLike = np.float32) -> np.ndarray:
+        """Return (H, W, 3) surface points in metres; they mean nothing where no surface is hit."""
+        return self.camera.points(self.depth, kind)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewPixels:
+class ViewPixels(Rows):
     """The pixels of one view that hit the mesh, in reading order; n pixels.
 
     Attributes:
@@ -35,6 +60,7 @@ class ViewPixels:
         face, object_id: (n,) int32; from_front: (n,) bool, the camera is on the side of the face normal.
         value: (n, 3) photograph; valid, interior: (n,) bool.
         number: (n,) uint32 of view and pixel, by which rays that start there draw their random numbers.
+        base: (n, 5) float32 base albedo, roughness and metallic; None = nobody asked.
     """
 
     index: np.ndarray
@@ -48,45 +74,48 @@ class ViewPixels:
     valid: np.ndarray
     interior: np.ndarray
     number: np.ndarray
+    base: np.ndarray | None = None
 
-    def take(self, choice: np.ndarray) -> ViewPixels:
-        """Return the chosen pixels."""
-        return ViewPixels(**{name: array[choice] for name, array in self.__dict__.items()})
+    @property
+    def of_object(self) -> np.ndarray:
+        """(n,) bool: the pixel shows an object."""
+        return self.object_id >= 0
 
 
-def pixels_of_view(view: View, decoded: DecodedView, normals: np.ndarray, among: np.ndarray | None = None) -> ViewPixels:
+def pixels_of_view(
+    maps: ViewMaps, normals: np.ndarray, among: np.ndarray | None = None, base: np.ndarray | None = None
+) -> ViewPixels:
     """Collect the pixels of a view that hit the mesh.
 
     Args:
-        view: the camera.
-        decoded: photograph, G-buffer and segmentation of the view.
+        maps: of the view, with objects and interior.
         normals: (m, 3) of the faces, 0 for degenerate ones.
-        among: (H * W,) bool, pixels that may be collected; None = all.
+        among: (H, W) bool, pixels that may be collected; None = all.
+        base: (H * W, 5) base albedo, roughness and metallic; None = nobody asks.
 
     Returns:
         One row for each pixel that hits the mesh.
     """
-    photo, valid, depth, face, object_id, interior = decoded
-    hit = (face.ravel() >= 0) & (depth.ravel() > 0)
-    hit = np.flatnonzero(hit if among is None else hit & among)
-    directions = view.directions().reshape(-1, 3)[hit]
-    points = (view.world_from_camera[:3, 3] + depth.reshape(-1, 1)[hit] * directions).astype(np.float32)
+    view, hit = maps.camera, maps.hit
+    index = np.flatnonzero(hit if among is None else hit & among)
+    directions = view.directions().reshape(-1, 3)[index]
     wo = -directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    face = face.ravel()[hit]
+    face = maps.face.ravel()[index]
     normals, front = towards_viewer(normals[face].astype(np.float32), wo)
-    value = photo.reshape(-1, 3)[hit]
+    value = maps.value.reshape(-1, 3)[index]
     return ViewPixels(
-        index=hit,
-        points=points,
+        index=index,
+        points=(view.world_from_camera[:3, 3] + maps.depth.reshape(-1, 1)[index] * directions).astype(np.float32),
         normals=normals.astype(np.float32),
         wo=wo.astype(np.float32),
         face=face,
-        object_id=object_id.ravel()[hit],
+        object_id=maps.object_id.ravel()[index],
         from_front=front,
         value=value,
-        valid=valid.ravel()[hit] & np.isfinite(value).all(1),
-        interior=interior.ravel()[hit],
-        number=((hit + view.view_id * 0x9E3779B1) & 0xFFFFFFFF).astype(np.uint32),
+        valid=maps.valid.ravel()[index] & np.isfinite(value).all(1),
+        interior=maps.interior.ravel()[index],
+        number=((index + view.view_id * 0x9E3779B1) & 0xFFFFFFFF).astype(np.uint32),
+        base=None if base is None else base[index],
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from iif_core.camera.pinhole import pixel_directions
 
@@ -28,3 +29,7 @@ class View:
     def directions(self) -> np.ndarray:
         """Return (H, W, 3) float32 world directions through pixel centres; point = origin + z-depth * direction (Eq. C.1)."""
         return pixel_directions(self.fx, self.fy, self.cx, self.cy, self.width, self.height, self.world_from_camera)
+
+    def points(self, depth: np.ndarray, kind: DTypeLike = np.float32) -> np.ndarray:
+        """Return (H, W, 3) surface points in metres from z-depth (H, W); they mean nothing where the depth is 0."""
+        return (self.world_from_camera[:3, 3] + depth[..., None] * self.directions()).astype(kind)

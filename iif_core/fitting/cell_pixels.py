@@ -10,6 +10,7 @@ from iif_core.camera.response import Response
 from iif_core.errors import InputError
 from iif_core.fitting.levels import interpolate_levels
 from iif_core.numerics.color import SRGB_KNEE
+from iif_core.numerics.rows import Rows
 from iif_core.reflectance.brdf import F0_DIELECTRIC as F0
 
 DARK = 1e-3
@@ -18,8 +19,8 @@ BOUND_WEIGHT = 1e-3
 """Weight of a saturated value, which bounds the radiance from below: it decides only where the cell has no other value."""
 
 
-@dataclass(frozen=True)
-class PixelRows:
+@dataclass(frozen=True, kw_only=True)
+class PixelRows(Rows):
     """Pixels with what was cached for them; n pixels, J levels.
 
     Attributes:
@@ -46,10 +47,6 @@ class PixelRows:
                 raise InputError(f"pixels of cells: {name} has shape {getattr(self, name).shape}, needed {shape}")
         if self.s0.ndim != 3 or self.s0.shape != (n, self.s0.shape[1], 3) or self.s1.shape != self.s0.shape:
             raise InputError(f"pixels of cells: shading of shapes {self.s0.shape}, {self.s1.shape}, needed ({n}, J, 3) twice")
-
-    def take(self, choice: np.ndarray) -> PixelRows:
-        """Return some of the pixels."""
-        return PixelRows(**{name: array[choice] for name, array in self.__dict__.items()})
 
     def usable(self, dark: float = 0.0) -> np.ndarray:
         """Return which pixels have a cell, finite values, positive weight and exposure, and more light than `dark`, (n,)."""

@@ -5,18 +5,19 @@ The sixteen numbers of an object are ordered as in `iif_core.reflectance.materia
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 
 from iif_core.camera.response import Response
 from iif_core.errors import InputError
 from iif_core.fitting.predictions import PredictionErrors
+from iif_core.numerics.rows import Rows
 
 
-@dataclass(frozen=True)
-class FitProblem:
+@dataclass(frozen=True, kw_only=True)
+class FitProblem(Rows):
     """Pixels of the fit; n pixels, J levels, h = 1 or 2 independent halves of the cache.
 
     Attributes:
@@ -35,6 +36,8 @@ class FitProblem:
         given: (O, 2) roughness and metallic of objects that are known and not fitted, NaN = fitted; None: all are fitted. Only
             the direct solver knows them.
     """
+
+    WHOLE: ClassVar[tuple[str, ...]] = ("levels", "scatter", "given")
 
     object_id: np.ndarray
     n_objects: int
@@ -67,16 +70,6 @@ class FitProblem:
                 raise InputError(f"fit: shading of shapes {d.shape}, {s0.shape}, {s1.shape}, needed {(n, 3)}, {(n, j, 3)}")
         if j < 2 or np.any(np.diff(self.levels) <= 0):
             raise InputError("fit: needs at least two increasing roughness levels")
-
-    def take(self, index: np.ndarray | slice) -> FitProblem:
-        """Return some of the pixels."""
-        changed: dict[str, Any] = {}
-        for name, value in self.__dict__.items():
-            # These belong to objects or to the whole problem, not to pixels.
-            if name in ("n_objects", "levels", "scatter", "given") or value is None:
-                continue
-            changed[name] = tuple(part[index] for part in value) if isinstance(value, tuple) else value[index]
-        return replace(self, **changed)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ LOWEST, NEUTRAL = np.float32(material.LOWEST), np.float32(material.NEUTRAL)
 Predictions = Callable[[int], NDArray] | Sequence[NDArray]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FusionProblem:
     """Predictions on surface cells.
 

@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from iif_core.camera.pinhole import pixel_directions
+from iif_core.camera.pixels import ViewMaps
 from iif_core.errors import InputError
 from iif_core.light.irradiance import (
     DARKEST,
@@ -78,46 +78,16 @@ FARTHEST, BRIGHTEST = 10.0, 30.0
 _MEDIAN_BINS, _MEDIAN_RANGE = 1024, (-10.0, 6.0)
 
 
-@dataclass(frozen=True)
-class ViewArrays:
-    """One photograph and what it shows of the mesh.
-
-    Attributes:
-        linear: (H, W, 3) float radiance times exposure, linear Rec. 709.
-        used: (H, W) bool: the photograph shows surface there, and its value is finite.
-        saturated: (H, W) bool.
-        depth: (H, W) float32 z-depth in metres, 0 = no surface.
-        normals: (H, W, 3) float32 unit normals towards the camera.
-        group: (H, W) int object or piece of the mesh, -1 = none.
-        world_from_camera: (4, 4), OpenCV axes; intrinsics: (4,) fx, fy, cx, cy in pixels.
-        exposure: > 0.
-    """
-
-    linear: NDArray
-    used: NDArray
-    saturated: NDArray
-    depth: NDArray
-    normals: NDArray
-    group: NDArray
-    world_from_camera: NDArray
-    intrinsics: NDArray
-    exposure: float
-
-    def rays(self) -> NDArray:
-        """Return (H, W, 3) directions of length 1 in z; point = centre + depth * direction."""
-        return pixel_directions(*self.intrinsics, self.depth.shape[1], self.depth.shape[0], self.world_from_camera)
-
-    def radiance(self) -> NDArray:
-        """Return (H, W, 3) float32 radiance, 0 where it is not used."""
-        return np.where(self.used[..., None], self.linear, 0).astype(np.float32) / np.float32(self.exposure)
-
-
 class Views(Protocol):
-    """A sequence of `ViewArrays`, which may read them when they are asked for."""
+    """A sequence of views, which may read them when they are asked for.
+
+    Their `value` is radiance times the exposure of the camera, which is > 0, linear Rec. 709. Only pixels with surface are valid.
+    `object_id` is the object or piece of the mesh. There are `saturated` and `normals`.
+    """
 
     def __len__(self) -> int: ...
 
-    def __getitem__(self, index: int, /) -> ViewArrays: ...
+    def __getitem__(self, index: int, /) -> ViewMaps: ...
 
 
 @dataclass(frozen=True)
@@ -179,10 +149,10 @@ class SceneLight:
     mean: float
     seen: list[NDArray]
 
-    def around(self, view: ViewArrays) -> tuple[NDArray, NDArray]:
+    def around(self, view: ViewMaps) -> tuple[NDArray, NDArray]:
         """Return rows of the cells around the n pixels of a view that show surface, and their weights, (n, k) each."""
-        hit = view.depth > 0
-        return self.field.weights(surface_points(view)[hit], view.normals[hit])
+        hit = view.hit
+        return self.field.weights(view.points()[hit], view.normals[hit])
 
     def log_at(self, row: NDArray, weight: NDArray) -> NDArray:
         """Return the log light (2, n, 3) float32 from the cells around n pixels."""
@@ -255,8 +225,8 @@ def gather_views(
 
     def sums_of(i: int) -> tuple[NDArray, NDArray]:
         view = views[i]
-        index = _spread(view.depth)
-        return view.group.ravel()[index], _reprojected(view, index, tables, cameras, neighbours[i])[2]
+        index = _spread(view.hit)
+        return view.object_id.ravel()[index], _reprojected(view, index, tables, cameras, neighbours[i])[2]
 
     for objects, sums in map_in_order(sums_of, len(views), threads):
         pool.add(objects, sums)
@@ -305,7 +275,7 @@ def with_computed_light(gathering: Gathering, views: Views, irradiance: Iterable
     # -------- mean log light of each cell, over the pixels that are nearest to it --------
     total, count = np.zeros((cells, 3)), np.zeros(cells)
     for i, (own, picture) in enumerate(zip(gathering.lights, irradiance, strict=True)):
-        value = picture[views[i].depth > 0].astype(np.float64)
+        value = picture[views[i].hit].astype(np.float64)
         known = np.isfinite(value).all(1) & (value > 0).all(1)
         nearest = own.row[known, 0].astype(np.int64)  # rows are in the order of distance
         count += np.bincount(nearest, minlength=cells)
@@ -330,9 +300,9 @@ def _medians(views: Views, light: SceneLight, lights: list[ViewLight]) -> tuple[
     medians = _Medians()
     for i, own in enumerate(lights):
         view = views[i]
-        hit = view.depth > 0
+        hit = view.hit
         y = log_radiance(view)[hit] - light.log_at(own.row, own.weight)[0]
-        medians.add(view.group[hit], y, (view.used & ~view.saturated)[hit])
+        medians.add(view.object_id[hit], y, (view.valid & ~view.saturated)[hit])
     return medians.group, medians.values()
 
 
@@ -344,7 +314,7 @@ def features(gathering: Gathering, views: Views, i: int) -> NDArray:
     """
     view = views[i]
     shape, n = view.depth.shape, view.depth.size
-    hit = np.flatnonzero(view.depth.ravel() > 0)
+    hit = np.flatnonzero(view.hit.ravel())
     own_log = log_radiance(view).reshape(n, 3)
     samples, count, sums = _reprojected(view, hit, gathering.tables, gathering.cameras, gathering.neighbours[i])
     own = gathering.tables[i]
@@ -355,7 +325,7 @@ def features(gathering: Gathering, views: Views, i: int) -> NDArray:
     y = (own_log[hit] - light[0]).clip(*QUOTIENT)
     put("y_r", y)
     put("dy_r", (light[0] - light[1]).clip(-2, 2))
-    grey = own_log.mean(-1)[view.used.ravel()]  # one number for a pixel, so that the colour of the view stays in the input
+    grey = own_log.mean(-1)[view.valid.ravel()]  # one number for a pixel, so that the colour of the view stays in the input
     put("i_r", (own_log[hit] - (np.median(grey) if len(grey) else 0.0)).clip(-5, 4))
     # -------- over the views that see the same point, relative to this one --------
     # The view's own value is rounded to the same steps as the samples, so a point that no other view sees has exactly 0.
@@ -369,7 +339,7 @@ def features(gathering: Gathering, views: Views, i: int) -> NDArray:
     known = np.isfinite(own.mirrored[hit])
     distance = gathering.lights[i].distance.astype(np.float32)
     # The same unit and the same floor as in `_prepared`, so that their difference compares like with like.
-    floored = np.log(np.maximum(view.radiance().reshape(n, 3)[hit] / gathering.light.mean, 1e-3))
+    floored = np.log(np.maximum(radiance_of(view).reshape(n, 3)[hit] / gathering.light.mean, 1e-3))
     met = gathering.lights[i].mirrored.astype(np.float32)
     put("m_r", np.where(known[:, None], met - floored, 0).clip(-5, 5))
     put("m_known", known)
@@ -379,18 +349,18 @@ def features(gathering: Gathering, views: Views, i: int) -> NDArray:
     # -------- shape --------
     normal = view.normals.reshape(n, 3)[hit]
     # Row vectors: n R is R' n, the normal in the axes of the camera.
-    put("n_x", normal @ view.world_from_camera[:3, :3].astype(np.float32))
-    towards = -view.rays().reshape(n, 3)[hit]
+    put("n_x", normal @ view.camera.world_from_camera[:3, :3].astype(np.float32))
+    towards = -view.camera.directions().reshape(n, 3)[hit]
     put("nov", (normal * towards).sum(-1) / np.linalg.norm(towards, axis=-1))  # rays have length 1 in z, not unit length
     depth = np.log(np.maximum(view.depth.ravel()[hit], 0.05))
     put("depth", (depth - np.median(depth) if len(hit) else depth).clip(-2, 2))
-    put("border", borders(view.group).ravel()[hit])
+    put("border", borders(view.object_id).ravel()[hit])
     put("hit", np.ones(len(hit)))
-    put("valid", view.used.ravel()[hit])
+    put("valid", view.valid.ravel()[hit])
     put("saturated", view.saturated.ravel()[hit])
     # -------- the object as a whole --------
     # Every id that shows surface has a row, because the medians were taken over the same pixels.
-    row = np.searchsorted(gathering.group, view.group.ravel()[hit])
+    row = np.searchsorted(gathering.group, view.object_id.ravel()[hit])
     put("g_r", gathering.median[row] - y)
     put("g_slope", gathering.slope[row])
     put("g_corr", gathering.correlation[row])
@@ -417,11 +387,11 @@ class _Writer:
             self.out[first + c, self.hit] = column
 
 
-def camera_of(view: ViewArrays) -> Camera:
+def camera_of(view: ViewMaps) -> Camera:
     """Return the camera of a view as the compiled loops read it."""
-    pose, (height, width) = np.asarray(view.world_from_camera, np.float64), view.depth.shape
+    own, pose = view.camera, np.asarray(view.camera.world_from_camera, np.float64)
     rotation = np.ascontiguousarray(pose[:3, :3].T)
-    return Camera(rotation, pose[:3, 3].copy(), np.asarray(view.intrinsics, np.float64), width, height)
+    return Camera(rotation, pose[:3, 3].copy(), np.array([own.fx, own.fy, own.cx, own.cy], np.float64), own.width, own.height)
 
 
 def _cells(views: Views) -> tuple[SurfaceCells, float, list[NDArray]]:
@@ -430,10 +400,10 @@ def _cells(views: Views) -> tuple[SurfaceCells, float, list[NDArray]]:
     footprints, low, high = [], np.full(3, np.inf), np.full(3, -np.inf)
     for i in range(len(views)):
         view = views[i]
-        hit = view.depth > 0
+        hit = view.hit
         if hit.any():
-            footprints.append(float(np.median(view.depth[hit])) / float(view.intrinsics[0]))
-            points = surface_points(view)[hit]
+            footprints.append(float(np.median(view.depth[hit])) / view.camera.fx)
+            points = view.points()[hit]
             low, high = np.minimum(low, points.min(0)), np.maximum(high, points.max(0))
     if not footprints:
         raise InputError("prior: no photograph shows the mesh; compare poses and mesh (`alignment` in capture/capture.json)")
@@ -444,32 +414,32 @@ def _cells(views: Views) -> tuple[SurfaceCells, float, list[NDArray]]:
     block = 4 * builder.edge
     for i in range(len(views)):
         view = views[i]
-        use, points = view.used, surface_points(view)
-        radiance = view.radiance()[use]
-        builder.add(points[use], view.normals[use], view.group[use], radiance, view.saturated[use], view.exposure)
+        use, points = view.valid, view.points()
+        radiance = radiance_of(view)[use]
+        builder.add(points[use], view.normals[use], view.object_id[use], radiance, view.saturated[use], view.camera.exposure)
         total, count = total + float(radiance.sum(dtype=np.float64)), count + radiance.size
-        where = np.floor((points[view.depth > 0] - low) / block).astype(np.int64)
+        where = np.floor((points[view.hit] - low) / block).astype(np.int64)
         seen.append(np.unique((where[:, 0] << 42) | (where[:, 1] << 21) | where[:, 2]))  # three indices of 21 bits
     return builder.finish(), max(total / max(count, 1), 1e-6), seen
 
 
-def surface_points(view: ViewArrays) -> NDArray:
-    """Return (H, W, 3) float32 surface points in metres."""
-    return (view.world_from_camera[:3, 3] + view.depth[..., None] * view.rays()).astype(np.float32)
+def radiance_of(view: ViewMaps) -> NDArray:
+    """Return (H, W, 3) float32 radiance, 0 where it may not be used."""
+    return np.where(view.valid[..., None], view.value, 0).astype(np.float32) / np.float32(view.camera.exposure)
 
 
-def log_radiance(view: ViewArrays) -> NDArray:
+def log_radiance(view: ViewMaps) -> NDArray:
     """Return (H, W, 3) float32 log radiance, floored at the noise of the view."""
-    return np.log(np.maximum(view.radiance(), np.float32(DARKEST / view.exposure)))
+    return np.log(np.maximum(radiance_of(view), np.float32(DARKEST / view.camera.exposure)))
 
 
-def _prepared(view: ViewArrays, light: SceneLight, trace: Trace) -> tuple[ViewTable, ViewLight]:
+def _prepared(view: ViewMaps, light: SceneLight, trace: Trace) -> tuple[ViewTable, ViewLight]:
     """What other views look up in a view, and what only the view itself reads again."""
     n, cells = view.depth.size, light.cells
-    hit = np.flatnonzero(view.depth.ravel() > 0)
-    points, normals = surface_points(view).reshape(n, 3)[hit], view.normals.reshape(n, 3)[hit]
+    hit = np.flatnonzero(view.hit.ravel())
+    points, normals = view.points().reshape(n, 3)[hit], view.normals.reshape(n, 3)[hit]
     # Mirrored rays, and the photographed radiance of the voxel that they meet.
-    towards = -view.rays().reshape(n, 3)[hit]
+    towards = -view.camera.directions().reshape(n, 3)[hit]
     towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
     # Mirror direction 2 (n . w) n - w of the unit vector w to the camera; of unit length, so t is in metres.
     way = (2 * (normals * towards).sum(-1, keepdims=True) * normals - towards).astype(np.float32)
@@ -489,9 +459,9 @@ def _prepared(view: ViewArrays, light: SceneLight, trace: Trace) -> tuple[ViewTa
     table = ViewTable(
         np.asarray(view.depth, np.float32).ravel(),
         np.rint(view.normals.reshape(n, 3) * NORMAL_STEPS).astype(np.int8),
-        view.used.ravel(),
+        view.valid.ravel(),
         as_steps(log_radiance(view).reshape(n, 3)),
-        (view.radiance().reshape(n, 3).mean(-1) / light.mean).astype(np.float32),
+        (radiance_of(view).reshape(n, 3).mean(-1) / light.mean).astype(np.float32),
         luminance,
     )
     row, weight = light.around(view)
@@ -516,19 +486,19 @@ def _neighbours(seen: list[NDArray]) -> list[NDArray]:
     return out
 
 
-def _spread(depth: NDArray) -> NDArray:
+def _spread(hit: NDArray) -> NDArray:
     """Pixels that show surface, at most POOL_PIXELS or so: all, or every second, third, ... row and column."""
-    step = int(np.ceil(np.sqrt(depth.size / POOL_PIXELS)))
-    kept = np.zeros(depth.shape, bool)
+    step = int(np.ceil(np.sqrt(hit.size / POOL_PIXELS)))
+    kept = np.zeros(hit.shape, bool)
     kept[::step, ::step] = True
-    return np.flatnonzero((kept & (depth > 0)).ravel())
+    return np.flatnonzero(kept & hit)
 
 
 def _reprojected(
-    view: ViewArrays, index: NDArray, tables: list[ViewTable], cameras: list[Camera], neighbours: NDArray
+    view: ViewMaps, index: NDArray, tables: list[ViewTable], cameras: list[Camera], neighbours: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Samples, their number and the sums of `add_samples` for the pixels `index` of a view, whose own number comes first."""
-    point, normal = surface_points(view).reshape(-1, 3)[index], view.normals.reshape(-1, 3)[index].astype(np.float32)
+    point, normal = view.points().reshape(-1, 3)[index], view.normals.reshape(-1, 3)[index].astype(np.float32)
     samples = np.zeros((len(index), len(neighbours), 3), np.float32)
     count, sums = np.zeros(len(index), np.int32), np.zeros((len(index), 6))
     none = np.full(len(index), -1, np.int64)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from iif_core.priors.features import ViewArrays, log_radiance
+from iif_core.camera.pixels import ViewMaps
+from iif_core.priors.features import log_radiance
 from iif_core.priors.hypotheses import DARKEST_ALBEDO
 
 RIDGE = 1e-3
@@ -19,7 +20,7 @@ ELSEWHERE = 1e-3
 SAME_SIDE = 0.8
 
 
-def enlarged(maps: NDArray, scale: NDArray, small: ViewArrays, full: ViewArrays, factor: int) -> tuple[NDArray, NDArray]:
+def enlarged(maps: NDArray, scale: NDArray, small: ViewMaps, full: ViewMaps, factor: int) -> tuple[NDArray, NDArray]:
     """Enlarge the predictions of a view.
 
     Args:
@@ -59,7 +60,7 @@ def _box(image: NDArray) -> NDArray:
 class _Neighbours:
     """The four small pixels around each full one, and their weights."""
 
-    def __init__(self, small: ViewArrays, full: ViewArrays, factor: int):
+    def __init__(self, small: ViewMaps, full: ViewMaps, factor: int):
         (h, w), (height, width) = small.depth.shape, full.depth.shape
         # Positions in units of small pixels. Small pixel j shows the surface of full pixel factor j + factor // 2, which lies at
         # j.
@@ -73,7 +74,7 @@ class _Neighbours:
                 at = row.clip(0, h - 1)[:, None], column.clip(0, w - 1)[None]
                 cosine = (small.normals[at] * full.normals).sum(-1)
                 # Pixels without surface have no normal.
-                same = (small.group[at] == full.group) & ((cosine > SAME_SIDE) | (full.depth == 0))
+                same = (small.object_id[at] == full.object_id) & ((cosine > SAME_SIDE) | (full.depth == 0))
                 self.places.append(at)
                 weights.append((weight + 1e-6) * np.where(same, 1.0, ELSEWHERE))
         total = np.sum(weights, 0)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from iif_core.numerics.rows import Rows
 from iif_core.requirements.evidence import FOLDS, NOTHING, Evidence, folds_of_blocks, held_out_evidence
 
 MAX_POINTS = 2000
@@ -24,8 +25,8 @@ LEAST_ROWS = 8
 _DARKEST = 1e-3  # of the mean light: a point in the dark is no evidence without bound
 
 
-@dataclass(frozen=True)
-class LightRows:
+@dataclass(frozen=True, kw_only=True)
+class LightRows(Rows):
     """What n points and the rays from them show, channels averaged.
 
     Attributes:
@@ -106,8 +107,8 @@ def light_evidence(rows: LightRows, seed: int) -> dict[str, Evidence]:
     return found
 
 
-@dataclass(frozen=True)
-class GlossRows:
+@dataclass(frozen=True, kw_only=True)
+class GlossRows(Rows):
     """Pairs of photographs of n points, relative to the mean radiance of the two.
 
     Attributes:

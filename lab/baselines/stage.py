@@ -163,13 +163,13 @@ def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.nd
     block_of, owner = blocks_of(scene.cell_ijk, scene.cell_object, edge)
     prior = _object_means(job, capture, scene) if model == "iris" else None
     goal = prior[owner, :3] if prior is not None else None
-    views = CellPixels(job, capture, scene, mixed, block_of, len(owner))
+    views = CellPixels(job, DecodedViews(capture, job.read("segmentation")), scene, mixed, block_of, len(owner))
     sums = CellSums(owner, scene.n_objects, levels)
     curve, camera = (response("srgb") if not capture.is_hdr else response("identity")), []
     if goal is not None and not capture.is_hdr:
         share = min(1.0, CAMERA_PIXELS / max(views.count, 1))
         chosen = np.random.default_rng([job.seed, _STREAM]).random(len(owner)) < share
-        rows = _joined([rows.take(np.flatnonzero(chosen[rows.cell])) for rows, _ in views])
+        rows = PixelRows.joined([rows.take(np.flatnonzero(chosen[rows.cell])) for rows, _ in views])
         with job.timed("solve"):
             fitted = fit_camera(rows, sums, _start(job), goal, options, dark=views.dark)
         curve, camera = fitted.response, fitted.history
@@ -212,10 +212,6 @@ def _footprint(capture: CaptureReader) -> float:
         if (depth > 0).any():
             sizes.append(float(np.median(depth[depth > 0])) / view.fx)
     return float(np.median(sizes)) if sizes else 0.0
-
-
-def _joined(parts: list[PixelRows]) -> PixelRows:
-    return PixelRows(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in PixelRows.__dataclass_fields__})
 
 
 def _start(job: Job) -> Response:

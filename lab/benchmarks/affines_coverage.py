@@ -84,11 +84,24 @@ def planted(seed: int, objects: int, family: Family = FAMILIES["room"]) -> tuple
     for _ in range(2):
         noise = np.exp(rng.normal(0, family.cache, (n_cells, 3)) - 0.5 * family.cache**2)[cell]
         halves.append([shading[0] * noise, shading[1] * noise[:, None], shading[2] * noise[:, None]])
-    cached = [tuple(np.asarray(h[i], np.float32) for h in halves) for i in range(3)]
+    diffuse, s0, s1 = (tuple(np.asarray(h[i], np.float32) for h in halves) for i in range(3))
     saturated = value >= 0.99
     cluster = patches(obj, place[cell])
     value = np.minimum(value, 0.99)
-    return FitProblem(obj, objects, base, *cached, LEVELS, value, np.full(n, 0.5), saturated, cluster), truth
+    problem = FitProblem(
+        object_id=obj,
+        n_objects=objects,
+        base=base,
+        diffuse=diffuse,
+        s0=s0,
+        s1=s1,
+        levels=LEVELS,
+        value=value,
+        exposure=np.full(n, 0.5),
+        saturated=saturated,
+        cluster=cluster,
+    )
+    return problem, truth
 
 
 def fitted(seed: int, problem: FitProblem, family: Family) -> FitResult:

@@ -44,7 +44,14 @@ def wall(pixels: int, k: int, seed: int = 0) -> FusionProblem:
         noise = np.where(np.arange(k) % 2, 0.1, 0.01)[:, None, None] * rng.standard_normal((k, side * side, 5))
         predictions.append(np.clip(gain * texture[window].reshape(-1, 5) + noise, 0.01, 0.99).astype(np.float16))
     of_segment = np.tile(np.arange(OBJECTS, dtype=np.int32), VIEWS)
-    return FusionProblem(predictions, cells, segments, size * size, objects.ravel(), of_segment)
+    return FusionProblem(
+        predictions=predictions,
+        cell_of_pixel=cells,
+        segment_of_pixel=segments,
+        n_cells=size * size,
+        object_of_cell=objects.ravel(),
+        object_of_segment=of_segment,
+    )
 
 
 def measure(repeats: int = 3) -> list[dict[str, Any]]:

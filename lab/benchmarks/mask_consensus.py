@@ -64,7 +64,7 @@ def measure(folder: Path, seed: int, split: float, merge: float) -> dict[str, fl
     seen = pixels > 0
     vertex, corner = np.unique(surface.faces[seen].ravel(), return_index=True)
     of_vertex = np.flatnonzero(seen)[corner // 3]
-    spread = spread_faces(surface, masks.POINT_FOOTPRINTS * masks._footprint(capture, surface.views()))
+    spread = spread_faces(surface, masks.POINT_FOOTPRINTS * masks._footprint(surface.decoded, surface.views()))
     row: dict[str, float | int | str] = {"scene": folder.parent.name, "seed": seed, "views": len(capture.views)}
     row |= {"masks_a_view": float(np.mean(parts)), "things": len(np.unique(instance[seen]))}
     row |= {"objects": len(np.unique(found.object_of_face[seen])), "faces": len(surface.faces), "vertices_seen": len(vertex)}

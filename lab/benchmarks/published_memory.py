@@ -58,9 +58,19 @@ def measured(pixels: int) -> str:
         columns[1].append(rng.random((n, 3), np.float32))
         columns[2].append(np.ones(n))
     owner, value, exposure = (np.concatenate(columns.pop(0)) for _ in range(3))
-    light = ((diffuse.array(),), (s0.array(),), (s1.array(),))
     saturated = np.zeros((pixels, 3), bool)
-    problem = FitProblem(owner, OBJECTS, base.array(), *light, np.linspace(0.02, 1, LEVELS), value, exposure, saturated)
+    problem = FitProblem(
+        object_id=owner,
+        n_objects=OBJECTS,
+        base=base.array(),
+        diffuse=(diffuse.array(),),
+        s0=(s0.array(),),
+        s1=(s1.array(),),
+        levels=np.linspace(0.02, 1, LEVELS),
+        value=value,
+        exposure=exposure,
+        saturated=saturated,
+    )
     curve = response("srgb")
     options, largest = PublishedOptions(epochs=1), [0.0]
     threading.Thread(target=watch_memory, args=(largest,), daemon=True).start()

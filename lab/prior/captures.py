@@ -101,7 +101,7 @@ class Capture:
 
     def points(self, view: View, depth: np.ndarray) -> np.ndarray:
         """Return (H, W, 3) float32 surface points in metres."""
-        return (view.world_from_camera[:3, 3] + depth[..., None] * view.directions()).astype(np.float32)
+        return view.points(depth)
 
     @cached_property
     def tracer(self) -> Trace:

@@ -124,7 +124,7 @@ def cases(
         truth, masks = _truth(capture, view)
         if masks["albedo"].any():
             photo = capture.photo(view)[0]
-            inputs, group = features(gathering, views, int(number)), views[number].group
+            inputs, group = features(gathering, views, int(number)), views[number].object_id
             yield Case(
                 view.name, inputs, _shown(photo, capture.is_hdr), truth, masks, group, baseline(view) if baseline else None
             )

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.priors.features import CHANNELS, Gathering, ViewArrays, features, gather_again, gather_views
+from iif_core.camera.pixels import ViewMaps
+from iif_core.priors.features import CHANNELS, Gathering, features, gather_again, gather_views
 from lab.prior.captures import Capture
 from workflow.priors.views import CaptureViews
 from workflow.scene.normal_form import CaptureReader
@@ -45,7 +46,7 @@ class Crops:
         return len(self.inputs)
 
 
-class Views(list[ViewArrays]):
+class Views(list[ViewMaps]):
     """All views of a capture in memory, with the response that the product estimates.
 
     Args:
@@ -73,8 +74,8 @@ class Views(list[ViewArrays]):
         total, count = np.zeros((len(first.group), 3)), np.zeros(len(first.group))
         for i in range(0, len(self), every):
             albedo = albedo_of(first, i)
-            use = self[i].used & ~self[i].saturated & np.isfinite(albedo).all(-1)
-            row = np.searchsorted(first.group, self[i].group[use])
+            use = self[i].valid & ~self[i].saturated & np.isfinite(albedo).all(-1)
+            row = np.searchsorted(first.group, self[i].object_id[use])
             count += np.bincount(row, minlength=len(count))
             total += np.stack([np.bincount(row, np.log(np.maximum(a, 0.01)), len(count)) for a in albedo[use].T], 1)
         with np.errstate(invalid="ignore"):
@@ -132,7 +133,7 @@ def crops(capture: Capture, seed: int, edge: int = EDGE) -> Crops:
             at = np.s_[top : top + edge, left : left + edge]
             if counts[at].mean() < _SEEN or view.saturated[at].mean() > _CLIPPED:
                 continue
-            group = np.unique(view.group[at], return_inverse=True)[1].reshape(edge, edge)
+            group = np.unique(view.object_id[at], return_inverse=True)[1].reshape(edge, edge)
             whole = (slice(None), *at)
             out.append(
                 (inputs[whole].astype(np.float16), truth[whole], counts[at], np.minimum(group, 255).astype(np.uint8), number)

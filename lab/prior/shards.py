@@ -29,6 +29,7 @@ from lab.prior.inputs import Crops
 from lab.prior.photographs import Denoiser
 
 INPUT_MODULES = [
+    "iif_core.camera.pixels",
     "iif_core.light.irradiance",
     "iif_core.priors.features",
     "iif_core.priors.reprojection",

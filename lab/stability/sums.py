@@ -221,4 +221,11 @@ def _fusion_problem(views: int = 6, pixels: int = 2000, cells: int = 900, object
         cell_of_pixel.append(cell)
         segment_of_pixel.append((view * objects + object_of_cell[cell]).astype(np.int32))
     owners = np.tile(np.arange(objects, dtype=np.int32), views)
-    return FusionProblem(maps, cell_of_pixel, segment_of_pixel, cells, object_of_cell, owners)
+    return FusionProblem(
+        predictions=maps,
+        cell_of_pixel=cell_of_pixel,
+        segment_of_pixel=segment_of_pixel,
+        n_cells=cells,
+        object_of_cell=object_of_cell,
+        object_of_segment=owners,
+    )

@@ -43,7 +43,9 @@ def plant(cells=120, objects=3, per_cell=6, seed=0, family="identity", params=No
         value, exposure = radiance, np.ones(n)
     else:
         value = np.minimum(curve(exposure[:, None] * radiance), 0.99)
-    rows = PixelRows(cell, np.ones(n), d, s0, s1, value, exposure, value >= 0.99)
+    rows = PixelRows(
+        cell=cell, weight=np.ones(n), diffuse=d, s0=s0, s1=s1, value=value, exposure=exposure, saturated=value >= 0.99
+    )
     return rows, object_id, objects, truth, curve
 
 
@@ -222,7 +224,9 @@ def test_extremes_are_finite_and_bounded():
     value[(cell >= 14) & (cell < 16)] = 1e9
     d[(cell >= 16) & (cell < 18)] = 1e-30
     cell[cell >= 55] = -1  # cells without pixels
-    broken = PixelRows(cell, rows.weight, d, s0, rows.s1, value, exposure, rows.saturated)
+    broken = PixelRows(
+        cell=cell, weight=rows.weight, diffuse=d, s0=s0, s1=rows.s1, value=value, exposure=exposure, saturated=rows.saturated
+    )
     problem = collect(broken, object_id, objects + 1, curve, dark=1e-6)  # and an object without cells
     for options in (FIPT, IRIS):
         prior = np.full((60, 3), 0.4) if options.prior else None
@@ -281,7 +285,7 @@ def test_claimed_deviation_is_that_of_the_noise():
         (lambda: CellSums(np.array([0]), 1, np.array([1.0, 0.5])), ["cells", "roughness levels"]),
         (lambda: CellOptions(part_weight="area"), ["part_weight", "'area'", "specular, gloss"]),
         (lambda: solve_direct(CellSums(np.array([0]), 1, LEVELS).problem(), IRIS), ["prior albedo", "(1, 3)"]),
-        (lambda: plant(cells=3)[0].take(np.arange(3)).__class__(*[np.zeros(2)] * 8), ["diffuse", "(2,)", "(2, 3)"]),
+        (lambda: PixelRows(**dict.fromkeys(PixelRows.__dataclass_fields__, np.zeros(2))), ["diffuse", "(2,)", "(2, 3)"]),
     ],
 )
 def test_bad_input(make, words):

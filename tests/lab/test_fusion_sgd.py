@@ -529,7 +529,17 @@ def test_bad_calls_are_refused():
     with refused("base sgd", "FusionProblem.point"):
         solve_sgd(problem, sgd_options("paper"))
     with refused("base sgd", "cell", "segment", "weight"):
-        solve_sgd(FusionProblem([], [], [], 3, np.zeros(3, int), np.zeros(0, int)), QUICK)
+        solve_sgd(
+            FusionProblem(
+                predictions=[],
+                cell_of_pixel=[],
+                segment_of_pixel=[],
+                n_cells=3,
+                object_of_cell=np.zeros(3, int),
+                object_of_segment=np.zeros(0, int),
+            ),
+            QUICK,
+        )
     with refused("base sgd", "1 of 8", "memory"):
         solve_sgd(problem, replace(QUICK, memory=1000))
     with refused("segment 0"):

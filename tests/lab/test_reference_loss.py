@@ -18,13 +18,13 @@ def random_state(seed=0, views=3, k=5, n=40, cells=20, spread=0.1):
     rng = np.random.default_rng(seed)
     segment = [np.repeat([2 * v, 2 * v + 1], n // 2).astype(np.int32) for v in range(views)]
     problem = FusionProblem(
-        [rng.random((k, n, 5)) for _ in range(views)],
-        [rng.integers(0, cells, n).astype(np.int32) for _ in range(views)],
-        segment,
-        cells,
-        np.zeros(cells, np.int32),
-        np.zeros(2 * views, np.int32),
-        [rng.uniform(0.1, 1, n) for _ in range(views)],
+        predictions=[rng.random((k, n, 5)) for _ in range(views)],
+        cell_of_pixel=[rng.integers(0, cells, n).astype(np.int32) for _ in range(views)],
+        segment_of_pixel=segment,
+        n_cells=cells,
+        object_of_cell=np.zeros(cells, np.int32),
+        object_of_segment=np.zeros(2 * views, np.int32),
+        weight=[rng.uniform(0.1, 1, n) for _ in range(views)],
     )
     s = 2 * views
     albedo = np.eye(3, 4) + spread * rng.standard_normal((s, k, 3, 4))
@@ -96,7 +96,14 @@ def test_known_divergence():
     """KL(d = 0.3, b_r = 0.1, b_p = 0.2) = 1.2180407 (Eq. F.7): three predictions 0.1 about 0.5, texture 0.8."""
     predictions = [np.repeat(np.array([0.4, 0.5, 0.6])[:, None, None], 5, 2)]
     zero = np.zeros(1, np.int32)
-    problem = FusionProblem(predictions, [zero], [zero], 1, zero, zero)
+    problem = FusionProblem(
+        predictions=predictions,
+        cell_of_pixel=[zero],
+        segment_of_pixel=[zero],
+        n_cells=1,
+        object_of_cell=zero,
+        object_of_segment=zero,
+    )
     identity = (np.eye(3, 4)[None, None].repeat(3, 1), np.tile([1.0, 0.0], (1, 3, 1)), np.tile([1.0, 0.0], (1, 3, 1)))
     # weights so that mu_ref = 0.5 and the distances are 0.1, 0, 0.1: the lower median is 0.1
     found = reference_loss(problem, np.full((1, 5), 0.8), np.full((1, 5), 0.2), identity, np.full((1, 3, 3), 1 / 3))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from iif_core.camera.gains import CameraGains
-from iif_core.camera.pixels import DecodedView
+from iif_core.camera.pixels import ViewMaps
 from iif_core.camera.response import response
 from iif_core.camera.view import View
 from iif_core.light.base_scene import BaseScene
@@ -82,11 +82,17 @@ def photographed(
         inner = np.ones((size, size), bool)
         for axis, shift in ((0, 1), (0, -1), (1, 1), (1, -1)):
             inner &= np.roll(objects, shift, axis) == objects
-        decoded = DecodedView(
-            photo, np.ones((size, size), bool), np.where(met >= 0, depth.reshape(size, size), 0), met, objects, inner
+        maps = ViewMaps(
+            camera=view,
+            value=photo,
+            valid=np.ones((size, size), bool),
+            depth=np.where(met >= 0, depth.reshape(size, size), 0),
+            face=met,
+            object_id=objects,
+            interior=inner,
         )
         base = np.where((face >= 0)[:, None], room.material[face], 0)
-        records[view.view_id] = ViewRecord.of(view, decoded, scene.normals, base)
+        records[view.view_id] = ViewRecord.of(maps, scene.normals, base)
     photos = Photographs(
         views=cameras,
         every=cameras,

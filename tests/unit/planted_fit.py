@@ -54,5 +54,16 @@ def problem_of(rng, n_objects=6, per_object=400, truth=None, value_of=None, nois
         else:
             cached.append(shading)
     d, s0, s1 = (tuple(np.asarray(c[i], np.float32 if noise else np.float64) for c in cached) for i in range(3))
-    problem = FitProblem(obj, n_objects, base, d, s0, s1, LEVELS, value, np.ones(n), np.zeros((n, 3), bool))
+    problem = FitProblem(
+        object_id=obj,
+        n_objects=n_objects,
+        base=base,
+        diffuse=d,
+        s0=s0,
+        s1=s1,
+        levels=LEVELS,
+        value=value,
+        exposure=np.ones(n),
+        saturated=np.zeros((n, 3), bool),
+    )
     return problem, truth

@@ -182,7 +182,9 @@ class PlantedScene:
         group = np.where(self.room.truth[group].any(1) & (group >= 0), group, -1)
         if kind == "hdr_hidden":
             bound, radiance = bound | (group >= 0)[:, None], np.where((group >= 0)[:, None], 1.0, radiance)
-        rows = EmissionPixels(radiance, bound, self.room.object_id[self.face], self.view, self.tile, group)
+        rows = EmissionPixels(
+            radiance=radiance, bound=bound, object_id=self.room.object_id[self.face], view=self.view, tile=self.tile, group=group
+        )
         problem = assemble(rows, transport, len(self.room.truth))
         return problem, initial_radiance(rows, np.ones((len(self.room.truth), 3)), linear and kind == "hdr")
 

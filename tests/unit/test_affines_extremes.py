@@ -38,9 +38,21 @@ def _uniform(material, n=300, seed=0, level=1.0):
     base[:, 3], base[:, 4] = 0.5, 0.5
     shading = [level * part for part in shading_of(rng, len(truth))]
     obj = np.repeat(np.arange(len(material)), n)
-    halves = tuple((part, part) for part in shading)
+    diffuse, s0, s1 = ((part, part) for part in shading)
     value = radiance_of(truth, shading)
-    return FitProblem(obj, len(material), base, *halves, LEVELS, value, np.ones(len(obj)), np.zeros((len(obj), 3), bool)), truth
+    problem = FitProblem(
+        object_id=obj,
+        n_objects=len(material),
+        base=base,
+        diffuse=diffuse,
+        s0=s0,
+        s1=s1,
+        levels=LEVELS,
+        value=value,
+        exposure=np.ones(len(obj)),
+        saturated=np.zeros((len(obj), 3), bool),
+    )
+    return problem, truth
 
 
 def test_sharpest_and_roughest():

@@ -102,7 +102,9 @@ def test_groups_of_texels_are_solved_with_the_rest():
     y = np.einsum("ngc,gc->nc", a, truth)
     noisy = transport_of(tuple(a * (1 + 0.2 * rng.standard_normal(a.shape)) for _ in range(2)))
     none = np.full(n, -1)
-    pixels = EmissionPixels(y, np.zeros((n, 3), bool), np.arange(n) % 9, np.arange(n) % 4, np.arange(n), none)
+    pixels = EmissionPixels(
+        radiance=y, bound=np.zeros((n, 3), bool), object_id=np.arange(n) % 9, view=np.arange(n) % 4, tile=np.arange(n), group=none
+    )
     columns = np.repeat([0, 0, 1, 2], HEIGHT * WIDTH // 4).reshape(HEIGHT, WIDTH)
     sky = Sky(columns, np.array([500, 500, 0]), truth[1:] * [[1], [1], [0]], np.zeros(3, bool))
     problem = assemble(pixels, noisy, 4, None, sky)

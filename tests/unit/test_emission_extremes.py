@@ -95,7 +95,9 @@ def test_one_object_and_five_thousand(objects):
     y = gain[owner][:, None] * np.einsum("ngc,gc->nc", a, truth)
     group = np.where(np.arange(n) < 200, np.arange(n) % 2, -1)
     y[:200] = truth[group[:200]]
-    pixels = EmissionPixels(y, np.zeros((n, 3), bool), owner, np.zeros(n, int), np.arange(n) // 5, group)
+    pixels = EmissionPixels(
+        radiance=y, bound=np.zeros((n, 3), bool), object_id=owner, view=np.zeros(n, int), tile=np.arange(n) // 5, group=group
+    )
     initial = initial_radiance(pixels, np.ones((2, 3)), True)
     problem, _ = assemble(pixels, transport_of(a), 2).solve_object_gains(EmissionPrior.independent(initial))
     np.testing.assert_allclose(solve_emission(problem.rows, initial).radiance, truth, rtol=0.02)
@@ -107,7 +109,14 @@ def test_emitter_that_is_never_seen_is_left_to_its_light():
     y = np.einsum("ngc,gc->nc", a, truth)
     group = np.where(np.arange(1000) < 50, 0, -1)
     y[:50] = truth[0]
-    pixels = EmissionPixels(y, np.zeros((1000, 3), bool), np.zeros(1000, int), np.zeros(1000, int), np.arange(1000) // 4, group)
+    pixels = EmissionPixels(
+        radiance=y,
+        bound=np.zeros((1000, 3), bool),
+        object_id=np.zeros(1000, int),
+        view=np.zeros(1000, int),
+        tile=np.arange(1000) // 4,
+        group=group,
+    )
     white = transport_of(np.zeros((50, 2, 3), np.float32), 0.1)
     seen = initial_radiance(pixels, np.full((2, 3), 2.0), True)
     trial = assemble(pixels, transport_of(a.astype(np.float32)), 2, white)

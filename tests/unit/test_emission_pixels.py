@@ -47,7 +47,16 @@ def test_a_pane_behind_blinds_is_as_bright_as_its_light_and_not_as_its_pixels():
     y = truth * a[:, 0] * np.exp(0.1 * rng.standard_normal((n, 1)))
     y[:seen] = (share * truth + (1 - share) * 2.0)[:seen, None]
     coverage = np.where(group >= 0, share, 0.0)[:, None].astype(np.float32)
-    pixels = EmissionPixels(y, np.zeros((n, 3), bool), np.zeros(n, int), np.zeros(n, int), np.arange(n), group, coverage, 5.0)
+    pixels = EmissionPixels(
+        radiance=y,
+        bound=np.zeros((n, 3), bool),
+        object_id=np.zeros(n, int),
+        view=np.zeros(n, int),
+        tile=np.arange(n),
+        group=group,
+        coverage=coverage,
+        rest=5.0,
+    )
     transport = TracedTransport(np.broadcast_to(a.astype(np.float32), (2, 1, n, 1, 3)), np.zeros((2, 1, n, 3)))
     prior = EmissionPrior.independent(np.full((1, 3), 12.0))
     bounded = prior.solve(assemble(pixels, transport, 1).rows).radiance
@@ -68,7 +77,16 @@ def test_both_ends_of_a_pane_outweigh_the_rows_of_its_own_group():
     y[:seen] = 6.0
     coverage = np.zeros((n, n_groups), np.float32)
     coverage[:seen, 2] = 0.4
-    pixels = EmissionPixels(y, np.zeros((n, 3), bool), np.zeros(n, int), np.zeros(n, int), np.arange(n), group, coverage, 5.0)
+    pixels = EmissionPixels(
+        radiance=y,
+        bound=np.zeros((n, 3), bool),
+        object_id=np.zeros(n, int),
+        view=np.zeros(n, int),
+        tile=np.arange(n),
+        group=group,
+        coverage=coverage,
+        rest=5.0,
+    )
     transport = TracedTransport(np.broadcast_to(light.astype(np.float32), (2, 1, n, n_groups, 3)), np.zeros((2, 1, n, 3)))
     found = assemble(pixels, transport, n_groups)
     weight, matrix = found.rows.weight[found.anchor], found.rows.matrix[0, 0][found.anchor]
@@ -87,7 +105,7 @@ def test_averaged_rows_hold_the_means_of_what_was_observed_and_cached():
     matrix, cached = rng.random((2, 2, n, 3, 3)).astype(np.float32), 1e-6 * rng.random((2, 2, n, 3)).astype(np.float32)
     radiance = 1e3 * rng.random((n, 3)).astype(np.float32)
     none = np.zeros(n, int)
-    pixels = EmissionPixels(radiance, np.zeros((n, 3), bool), none, none, tile, none - 1)
+    pixels = EmissionPixels(radiance=radiance, bound=np.zeros((n, 3), bool), object_id=none, view=none, tile=tile, group=none - 1)
     rows = assemble(pixels, TracedTransport(matrix, cached), 3).rows
     np.testing.assert_allclose(rows.observed, radiance.reshape(-1, 6, 3).mean(1), rtol=1e-6)
     np.testing.assert_allclose(rows.cached, cached.reshape(2, 2, -1, 6, 3).mean(3), rtol=1e-6)

@@ -96,7 +96,14 @@ def test_rows_beside_one_another_and_some_of_them():
 
 def test_pixels_on_a_group_as_if_it_reflected():
     group, tile = np.array([0, 0, 1]), np.zeros(3, int)
-    pixels = EmissionPixels(np.arange(9.0).reshape(3, 3), np.zeros((3, 3), bool), np.full(3, 7), tile, tile, group)
+    pixels = EmissionPixels(
+        radiance=np.arange(9.0).reshape(3, 3),
+        bound=np.zeros((3, 3), bool),
+        object_id=np.full(3, 7),
+        view=tile,
+        tile=tile,
+        group=group,
+    )
     transport = TracedTransport(np.ones((2, 2, 3, 2, 3), np.float32), np.zeros((2, 2, 3, 3), np.float32))
     rows, of_group = reflecting_rows(pixels, transport, 2)
     assert of_group.tolist() == [0, 1] and rows.owner.tolist() == [7, 7] and not rows.anchor.any()

@@ -8,7 +8,7 @@ import pytest
 from iif_core.camera.pixels import ViewPixels
 from tests.errors import refused
 from workflow.artifacts.files import read_parquet, write_parquet
-from workflow.fitting.fit_pixels import FitPixels, count_eligible
+from workflow.fitting.fit_pixels import PixelDraw, count_eligible
 from workflow.scene.cached_light import SpecularLight, read_specular
 
 VIEW = SimpleNamespace(view_id=7, name="v007")
@@ -41,7 +41,7 @@ def test_objects_get_the_same_number_and_a_larger_draw_contains_a_smaller_one():
     pixels, mixed = _pixels(), np.arange(10) == 9
     counts = count_eligible(pixels, mixed, 4)
     assert counts[3] < 30
-    small, large = (FitPixels.evenly(counts, budget, mixed, 5).of(pixels, VIEW) for budget in (1500, 6000))
+    small, large = (PixelDraw.evenly(counts, budget, mixed, 5).of(pixels, VIEW) for budget in (1500, 6000))
     assert np.isin(small, large).all() and (np.diff(large) > 0).all()
     chosen = pixels.take(small)
     assert chosen.valid.all() and not mixed[chosen.face].any()

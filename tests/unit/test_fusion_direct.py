@@ -54,13 +54,13 @@ def problem_of(cell_maps, predictions, obj, border=1):
     segment_maps, table = segment_table(maps)
     weight = [np.where(interior(m, border), 1.0, 0.1) for m in maps]
     return FusionProblem(
-        predictions,
-        [c.astype(np.int32) for c in cell_maps],
-        segment_maps,
-        len(obj),
-        obj.astype(np.int32),
-        table.object,
-        weight,
+        predictions=predictions,
+        cell_of_pixel=[c.astype(np.int32) for c in cell_maps],
+        segment_of_pixel=segment_maps,
+        n_cells=len(obj),
+        object_of_cell=obj.astype(np.int32),
+        object_of_segment=table.object,
+        weight=weight,
     )
 
 
@@ -207,13 +207,13 @@ def test_doubled_views_change_nothing():
     n = problem.n_segments
     shifted = [np.where(m >= 0, m + n, -1) for m in problem.segment_of_pixel]
     twice = FusionProblem(
-        [*problem.predictions] * 2,
-        [*problem.cell_of_pixel] * 2,
-        [*problem.segment_of_pixel, *shifted],
-        problem.n_cells,
-        problem.object_of_cell,
-        np.tile(problem.object_of_segment, 2),
-        [*problem.weight] * 2,
+        predictions=[*problem.predictions] * 2,
+        cell_of_pixel=[*problem.cell_of_pixel] * 2,
+        segment_of_pixel=[*problem.segment_of_pixel, *shifted],
+        n_cells=problem.n_cells,
+        object_of_cell=problem.object_of_cell,
+        object_of_segment=np.tile(problem.object_of_segment, 2),
+        weight=[*problem.weight] * 2,
     )
     a, b = solve_direct(problem), solve_direct(twice)
     np.testing.assert_array_equal(2 * a.observations, b.observations)
@@ -340,7 +340,12 @@ def test_scale_equals_the_closed_form():
     values = np.array([[0.3, 0.34, 0.4], [0.5, 0.52, 0.6], [0.42, 0.44, 0.46]])  # views x K
     predictions = [np.repeat(v[:, None, None], 5, 2) for v in values]
     problem = FusionProblem(
-        predictions, [np.zeros(1, int)] * 3, [np.array([i]) for i in range(3)], 1, np.zeros(1, int), np.zeros(3, int)
+        predictions=predictions,
+        cell_of_pixel=[np.zeros(1, int)] * 3,
+        segment_of_pixel=[np.array([i]) for i in range(3)],
+        n_cells=1,
+        object_of_cell=np.zeros(1, int),
+        object_of_segment=np.zeros(3, int),
     )
     result = solve_variant(problem, "texel_mean")
     mean = values.mean(1)
@@ -551,7 +556,16 @@ def test_parts_of_an_object_that_share_no_cell():
 
 
 def test_no_views():
-    result = solve_direct(FusionProblem([], [], [], 3, np.zeros(3, int), np.zeros(0, int)))
+    result = solve_direct(
+        FusionProblem(
+            predictions=[],
+            cell_of_pixel=[],
+            segment_of_pixel=[],
+            n_cells=3,
+            object_of_cell=np.zeros(3, int),
+            object_of_segment=np.zeros(0, int),
+        )
+    )
     np.testing.assert_array_equal(result.value, [NEUTRAL] * 3)
 
 
@@ -587,7 +601,14 @@ rng = np.random.default_rng(0)
 maps = rng.random((2, 8, 40001, 5)).astype(np.float32)
 cell = [rng.permutation(40001) // 3 for _ in range(2)]
 segment = [np.full(40001, i) for i in range(2)]
-problem = FusionProblem(list(maps), cell, segment, 13334, np.zeros(13334, int), np.zeros(2, int))
+problem = FusionProblem(
+    predictions=list(maps),
+    cell_of_pixel=cell,
+    segment_of_pixel=segment,
+    n_cells=13334,
+    object_of_cell=np.zeros(13334, int),
+    object_of_segment=np.zeros(2, int),
+)
 result = solve_direct(problem)
 print(hashlib.sha256(result.value.tobytes() + result.scale.tobytes() + repr(result.history).encode()).hexdigest())
 """

@@ -28,7 +28,14 @@ def test_ten_thousand_objects_of_a_few_pixels():
     objects = cell // 4
     predictions = [np.clip(truth[objects] + 0.02 * rng.standard_normal((3, 4 * n, 5)), 0, 1) for _ in range(2)]
     segments = [objects, n + objects]
-    problem = FusionProblem(predictions, [cell, cell], segments, 4 * n, objects, np.tile(np.arange(n, dtype=np.int32), 2))
+    problem = FusionProblem(
+        predictions=predictions,
+        cell_of_pixel=[cell, cell],
+        segment_of_pixel=segments,
+        n_cells=4 * n,
+        object_of_cell=objects,
+        object_of_segment=np.tile(np.arange(n, dtype=np.int32), 2),
+    )
     result = solve_direct(problem)
     assert every_array_is_finite(result) and result.value.shape == (4 * n, 5)
     assert np.abs(result.object_value - truth).mean() < 0.02

@@ -23,7 +23,14 @@ def two_sides(level=(0.4, 0.6), size=20, spread=0.15, k=6):
     pairs = np.concatenate([across, down])
     maps = [cell[:, :size].copy(), cell[:, size:].copy()]
     segments = [np.zeros((size, size), np.int32), np.ones((size, size), np.int32)]
-    problem = FusionProblem([left, right], maps, segments, cell.size, np.zeros(cell.size, np.int32), np.zeros(2, np.int32))
+    problem = FusionProblem(
+        predictions=[left, right],
+        cell_of_pixel=maps,
+        segment_of_pixel=segments,
+        n_cells=cell.size,
+        object_of_cell=np.zeros(cell.size, np.int32),
+        object_of_segment=np.zeros(2, np.int32),
+    )
     return replace(problem, neighbours=pairs.astype(np.int32)), cell
 
 

@@ -10,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iif_core.camera.pinhole import look_at, pixel_directions
+from iif_core.camera.pixels import ViewMaps
+from iif_core.camera.view import View
 from iif_core.errors import InputError
 from iif_core.priors import features as inputs
-from iif_core.priors.features import CHANNELS, ViewArrays, features, gather_again, gather_views, mirrored, with_computed_light
+from iif_core.priors.features import CHANNELS, features, gather_again, gather_views, mirrored, with_computed_light
 from iif_core.priors.hypotheses import combined
 from iif_core.priors.reprojection import NORMAL_STEPS, Camera, ViewTable, add_samples, as_steps, from_steps, quantiles
 from iif_core.priors.upsampling import enlarged
@@ -42,16 +44,15 @@ def view_of(position, target, exposure=1.0, light=1.0):
     normals[np.arange(len(face)), face // 2] = np.where(face % 2, -1, 1)
     shape = HEIGHT, WIDTH
     linear = (ALBEDO[face] * light * exposure).reshape(*shape, 3).astype(np.float32)
-    return ViewArrays(
-        linear,
-        np.ones(shape, bool),
-        np.zeros(shape, bool),
-        depth.reshape(shape).astype(np.float32),
-        normals.reshape(*shape, 3),
-        face.reshape(shape),
-        pose,
-        intrinsics,
-        exposure,
+    return ViewMaps(
+        camera=View(0, "v", WIDTH, HEIGHT, *intrinsics.tolist(), pose, exposure),
+        value=linear,
+        valid=np.ones(shape, bool),
+        depth=depth.reshape(shape).astype(np.float32),
+        face=face.reshape(shape),
+        object_id=face.reshape(shape),
+        saturated=np.zeros(shape, bool),
+        normals=normals.reshape(*shape, 3),
     )
 
 
@@ -92,13 +93,16 @@ def test_surface_that_looks_alike_from_everywhere_has_equal_quantiles(room):
 
 def test_the_exposure_of_a_view_changes_no_input(room):
     plain = all_inputs(room)
-    changed = [replace(view, linear=view.linear * f, exposure=f) for view, f in zip(room, (1.0, 0.25, 4.0, 2.0), strict=True)]
+    changed = [
+        replace(view, value=view.value * f, camera=replace(view.camera, exposure=f))
+        for view, f in zip(room, (1.0, 0.25, 4.0, 2.0), strict=True)
+    ]
     assert np.abs(all_inputs(changed) - plain).max() < 0.02
 
 
 def test_a_common_factor_of_all_photographs_changes_no_input(room):
     plain = all_inputs(room)
-    darker = [replace(view, linear=view.linear * 0.5) for view in room]
+    darker = [replace(view, value=view.value * 0.5) for view in room]
     assert np.abs(all_inputs(darker) - plain).max() < 0.02
 
 
@@ -113,7 +117,7 @@ def test_equal_bytes_for_equal_seeds(room):
 
 
 def test_a_photograph_of_nothing_is_zero_and_a_room_of_nothing_is_refused(room):
-    blind = replace(room[0], depth=np.zeros_like(room[0].depth), used=np.zeros_like(room[0].used))
+    blind = replace(room[0], depth=np.zeros_like(room[0].depth), valid=np.zeros_like(room[0].valid))
     views = [*room[1:], blind]
     gathered = gather_views(views, trace_box)
     assert not features(gathered, views, 3).any()
@@ -128,7 +132,7 @@ def test_extreme_photographs_give_finite_inputs(light, kind):
     places = (((1, 1, 1.2), (4, 3, 1)), ((3, 2, 1.4), (0, 0, 0)))
     views = [view_of(np.array(a, float), np.array(b, float), light=light) for a, b in places]
     if kind == "black":
-        views[0] = replace(views[0], linear=np.zeros_like(views[0].linear))
+        views[0] = replace(views[0], value=np.zeros_like(views[0].value))
     if kind == "saturated":
         views = [replace(view, saturated=np.ones_like(view.saturated)) for view in views]
     if kind == "one":
@@ -150,7 +154,7 @@ def test_a_first_prediction_moves_the_light_and_nothing_else(room):
     first, second = (np.stack([features(g, room, i) for i in range(len(room))]) for g in (gathering, again))
     moved = {name for c, name in enumerate(CHANNELS) if not np.array_equal(first[:, c], second[:, c])}
     assert moved <= {"y_r", "y_g", "y_b", "dy_r", "dy_g", "dy_b", "g_r", "g_g", "g_b"} and "y_r" in moved
-    truth = np.log(ALBEDO)[np.stack([view.group for view in room])].transpose(0, 3, 1, 2)
+    truth = np.log(ALBEDO)[np.stack([view.object_id for view in room])].transpose(0, 3, 1, 2)
 
     def error(x):
         difference = channel(x, "y_r", 3) - truth
@@ -172,12 +176,12 @@ def test_light_that_falls_off_is_divided_out():
     views = []
     for position, target in (((1, 1, 1.2), (4, 3, 1)), ((3, 2, 1.4), (0, 0, 1)), ((2, 1.5, 1.2), (4, 0, 0.5))):
         view = view_of(np.array(position, float), np.array(target, float))
-        points = inputs.surface_points(view)
+        points = view.points()
         fall = np.exp(-0.8 * points[..., :1]) * np.exp(rng.normal(0, 0.01, (HEIGHT, WIDTH, 1)))
-        views.append(replace(view, linear=(0.5 * fall * np.ones(3)).astype(np.float32)))
+        views.append(replace(view, value=(0.5 * fall * np.ones(3)).astype(np.float32)))
     x = all_inputs(views)
     quotient = channel(x, "y_r", 3)
-    photograph = np.log(np.stack([view.linear for view in views]))
+    photograph = np.log(np.stack([view.value for view in views]))
     assert quotient.std() < 0.8 * photograph.std()
 
 
@@ -191,9 +195,9 @@ def lit():
     views, light = [], []
     for position, target in places:
         view = view_of(np.array(position, float), np.array(target, float))
-        points = inputs.surface_points(view).astype(np.float64)
+        points = view.points().astype(np.float64)
         light.append(np.exp(-0.7 * points[..., :1] + 0.5 * np.sin(3 * points[..., 1:2])) * np.array([1.0, 0.8, 0.6]))
-        views.append(replace(view, linear=(view.linear * light[-1]).astype(np.float32)))
+        views.append(replace(view, value=(view.value * light[-1]).astype(np.float32)))
     return views, light, gather_views(views, trace_box)
 
 
@@ -239,7 +243,7 @@ def test_where_no_light_was_computed_it_stays_the_gathered_one(lit):
     wall = 1  # x = 4 m
 
     def partly(i):
-        return np.where((views[i].group == wall)[..., None], np.nan, light[i])
+        return np.where((views[i].object_id == wall)[..., None], np.nan, light[i])
 
     again = with_computed_light(gathering, views, map(partly, range(len(views))))
     on_wall = gathering.light.cells.group == wall
@@ -277,9 +281,9 @@ def tables(room):
             ViewTable(
                 view.depth.ravel(),
                 np.rint(view.normals.reshape(n, 3) * NORMAL_STEPS).astype(np.int8),
-                view.used.ravel(),
-                as_steps(np.log(view.linear.reshape(n, 3))),
-                view.linear.reshape(n, 3).mean(-1),
+                view.valid.ravel(),
+                as_steps(np.log(view.value.reshape(n, 3))),
+                view.value.reshape(n, 3).mean(-1),
                 np.full(n, 0.5, np.float32),
             )
         )
@@ -290,11 +294,11 @@ def test_samples_are_what_projection_finds(room):
     """Every sample against a projection in plain NumPy, pixel by pixel."""
     first, second = room[0], room[3]
     n = first.depth.size
-    points, normals = inputs.surface_points(first).reshape(n, 3), first.normals.reshape(n, 3)
+    points, normals = first.points().reshape(n, 3), first.normals.reshape(n, 3)
     samples, count, sums = np.zeros((n, 2, 3), np.float32), np.zeros(n, np.int32), np.zeros((n, 6))
     camera: Camera = inputs.camera_of(second)
     add_samples(points, normals, np.full(n, -1, np.int64), camera, tables(room)[3], samples, count, sums)
-    local = (points - second.world_from_camera[:3, 3]) @ second.world_from_camera[:3, :3]
+    local = (points - second.camera.world_from_camera[:3, 3]) @ second.camera.world_from_camera[:3, :3]
     seen = 0
     for i in range(n):
         z = local[i, 2]
@@ -305,8 +309,8 @@ def test_samples_are_what_projection_finds(room):
         assert count[i] == same
         if same:
             seen += 1
-            assert np.allclose(samples[i, 0], np.log(second.linear[int(v), int(u)]), atol=1e-3)
-            luminance = second.linear[int(v), int(u)].mean()
+            assert np.allclose(samples[i, 0], np.log(second.value[int(v), int(u)]), atol=1e-3)
+            luminance = second.value[int(v), int(u)].mean()
             expected = [1, luminance, 0.5, luminance**2, 0.25, 0.5 * luminance]
             assert np.allclose(sums[i], expected, rtol=1e-4)
     assert 20 < seen < n
@@ -386,15 +390,15 @@ def test_mirroring_twice_is_nothing(room):
 def smaller(view, factor):
     """The view with only the middle pixel of every block, photographs averaged."""
     f, m = factor, factor // 2
-    blocks = view.linear.reshape(HEIGHT // f, f, WIDTH // f, f, 3).mean((1, 3))
-    take = {name: getattr(view, name)[m::f, m::f] for name in ("used", "saturated", "depth", "normals", "group")}
-    return replace(view, linear=blocks, **take)
+    blocks = view.value.reshape(HEIGHT // f, f, WIDTH // f, f, 3).mean((1, 3))
+    take = {name: getattr(view, name)[m::f, m::f] for name in ("valid", "saturated", "depth", "normals", "face", "object_id")}
+    return replace(view, value=blocks, **take)
 
 
 def test_constant_maps_stay_constant(room):
     small = smaller(room[0], 2)
     maps = np.broadcast_to(np.float32([0.3, 0.4, 0.5, 0.6, 0.1]), (2, *small.depth.shape, 5))
-    even = replace(room[0], linear=np.full_like(room[0].linear, 0.4))
+    even = replace(room[0], value=np.full_like(room[0].value, 0.4))
     scale = np.full((*small.depth.shape, 3), 0.2, np.float32)
     out, wide = enlarged(maps, scale, smaller(even, 2), even, 2)
     assert out.shape == (2, HEIGHT, WIDTH, 5) and np.allclose(out, maps[0, 0, 0], atol=1e-4)
@@ -405,13 +409,13 @@ def test_albedo_follows_texture_and_not_light(room):
     """Fine stripes of albedo come back; where the albedo is even, stripes of light do not enter."""
     stripes = np.where(np.arange(WIDTH) % 2, 0.3, 0.5)[None, :, None] * np.ones((HEIGHT, 1, 3))
     slow = np.linspace(0.2, 0.8, WIDTH)[None, :, None] * np.ones((HEIGHT, 1, 3))
-    wall = replace(room[0], group=np.zeros((HEIGHT, WIDTH), int), normals=np.tile(np.float32([0, 0, 1]), (HEIGHT, WIDTH, 1)))
+    wall = replace(room[0], object_id=np.zeros((HEIGHT, WIDTH), int), normals=np.tile(np.float32([0, 0, 1]), (HEIGHT, WIDTH, 1)))
     # The photograph is albedo under even light: the small albedo follows the small photograph exactly.
-    full = replace(wall, linear=(slow * stripes).astype(np.float32))
+    full = replace(wall, value=(slow * stripes).astype(np.float32))
     small = smaller(full, 2)
-    maps = np.concatenate([small.linear, np.full((*small.depth.shape, 2), 0.5)], -1)[None]
+    maps = np.concatenate([small.value, np.full((*small.depth.shape, 2), 0.5)], -1)[None]
     out, _ = enlarged(maps, np.zeros((*small.depth.shape, 3)), small, full, 2)
-    assert np.abs(out[0, 4:-4, 4:-4, :3] / full.linear[4:-4, 4:-4] - 1).mean() < 0.1  # 0.25 without the photograph
+    assert np.abs(out[0, 4:-4, 4:-4, :3] / full.value[4:-4, 4:-4] - 1).mean() < 0.1  # 0.25 without the photograph
     # The albedo is even, and all that the photograph shows is light.
     maps = np.full((1, *small.depth.shape, 5), 0.5)
     out, _ = enlarged(maps, np.zeros((*small.depth.shape, 3)), small, full, 2)
@@ -419,10 +423,10 @@ def test_albedo_follows_texture_and_not_light(room):
 
 
 def test_roughness_does_not_cross_borders_of_objects(room):
-    view = replace(room[0], group=(np.arange(WIDTH)[None] >= 20).astype(int) * np.ones((HEIGHT, 1), int))
+    view = replace(room[0], object_id=(np.arange(WIDTH)[None] >= 20).astype(int) * np.ones((HEIGHT, 1), int))
     view = replace(view, normals=np.tile(np.float32([0, 0, 1]), (HEIGHT, WIDTH, 1)))
     small = smaller(view, 4)
-    maps = np.concatenate([np.full((*small.depth.shape, 3), 0.5), np.where(small.group == 1, 0.9, 0.1)[..., None]], -1)
+    maps = np.concatenate([np.full((*small.depth.shape, 3), 0.5), np.where(small.object_id == 1, 0.9, 0.1)[..., None]], -1)
     maps = np.concatenate([maps, np.zeros((*small.depth.shape, 1))], -1)[None]
     out, _ = enlarged(maps, np.zeros((*small.depth.shape, 3)), small, view, 4)
-    assert np.abs(out[0, ..., 3] - np.where(view.group == 1, 0.9, 0.1)).max() < 0.01
+    assert np.abs(out[0, ..., 3] - np.where(view.object_id == 1, 0.9, 0.1)).max() < 0.01

@@ -114,10 +114,10 @@ def test_rows_are_of_pixels_that_show_one_thing(closed):
     photos, _ = closed
     look = look_around(photos, neighbours(photos))
     blind = of_views(photos, lambda r: replace(r, pixels=replace(r.pixels, valid=np.zeros_like(r.pixels.valid))), [1])
-    pixels, base, rows = choose_rows(blind, look.groups, look.threshold)
-    assert len(base) == len(pixels.index) == len(rows.radiance) and set(rows.view) == {0, 2, 3}
+    pixels, rows = choose_rows(blind, look.groups, look.threshold)
+    assert len(pixels.base) == len(pixels.index) == len(rows.radiance) and set(rows.view) == {0, 2, 3}
     assert pixels.interior[rows.group < 0].all() and rows.rest == look.threshold
-    thin = choose_rows(blind, look.groups, look.threshold, thin=4)[2]
+    thin = choose_rows(blind, look.groups, look.threshold, thin=4)[1]
     assert 0 < (thin.group < 0).sum() <= 3 * -(-photos.options.rows // 16) < (rows.group < 0).sum()
     again = choose_rows(blind, look.groups, look.threshold)[0]
     np.testing.assert_array_equal(again.number, pixels.number)

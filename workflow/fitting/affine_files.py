@@ -13,12 +13,33 @@ from iif_core.reflectance.material import CHANNELS, NUMBERS_OF, apply_affines
 from workflow.artifacts.store import ids_from_disk, split_rgb
 from workflow.decisions import camera, materials, numerics
 from workflow.decisions.record import Decision
+from workflow.fitting.fit_input import FitInputs
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import base_maps, read_base
+from workflow.scene.base_scene import base_channels, read_base
 from workflow.scene.normal_form import CaptureReader
+from workflow.scene.recovered import write_response
 
 
-def write_facts(job: Job, solver: str, fit: FitResult, plan: list[Decision]) -> None:
+def write_fit(job: Job, inputs: FitInputs, fit: FitResult, solver: str) -> None:
+    """Write the artefacts of stage affines; `solver`: the name of what fitted."""
+    names, capture, given = inputs.names, inputs.capture, inputs.problem.given
+    for o, name in enumerate(names):
+        job.log.debug("%s: %s, residual %.4f", name, fit.model[o], fit.residual[o])
+    _write_objects(job, names, fit, given)
+    if not capture.is_hdr:
+        write_response(job, fit.response)
+    albedo = inputs.textures.albedo(fit) if inputs.textures is not None else None
+    _write_cells(job, fit, albedo)
+    _write_maps(job, capture, fit, albedo)
+    plan = _plan_of_fit(
+        inputs.problem, fit, inputs.calibration, capture.facts["dynamic_range"], job.settings.components.metallic
+    )
+    if given is not None:
+        plan.append(materials.given_by_hand(names, given))
+    _write_facts(job, solver, fit, plan)
+
+
+def _write_facts(job: Job, solver: str, fit: FitResult, plan: list[Decision]) -> None:
     """Write affines.json; `solver`: the name of what fitted."""
     spread = np.sqrt(np.clip(np.diagonal(fit.response_covariance), 0.0, None))
     weight = np.maximum(fit.pixels, 1e-9)
@@ -42,7 +63,7 @@ def write_facts(job: Job, solver: str, fit: FitResult, plan: list[Decision]) -> 
     )
 
 
-def write_objects(job: Job, names: list[str], fit: FitResult, given: np.ndarray | None) -> None:
+def _write_objects(job: Job, names: list[str], fit: FitResult, given: np.ndarray | None) -> None:
     """Write objects.parquet: numbers, standard deviations and model of every object."""
     spread = np.sqrt(np.clip(np.diagonal(fit.covariance, axis1=1, axis2=2), 0.0, None))
     columns: dict[str, Any] = {
@@ -65,7 +86,7 @@ def write_objects(job: Job, names: list[str], fit: FitResult, given: np.ndarray 
     job.writer.table("objects.parquet", columns, {"residual": "sensor value"})
 
 
-def write_cells(job: Job, fit: FitResult, albedo: np.ndarray | None) -> None:
+def _write_cells(job: Job, fit: FitResult, albedo: np.ndarray | None) -> None:
     """Write cells.parquet: corrected materials, with the given albedo (C, 3) instead if there is one."""
     deviations = [f"uncertainty_albedo_{c}" for c in "rgb"]
     cells = read_base(job).table("cells.parquet", ("cell_id", "object_id", *CHANNELS, *deviations))
@@ -83,13 +104,14 @@ def write_cells(job: Job, fit: FitResult, albedo: np.ndarray | None) -> None:
     job.writer.table("cells.parquet", {**columns, "uncertainty": spread.astype(np.float32)})
 
 
-def write_maps(job: Job, capture: CaptureReader, fit: FitResult, albedo: np.ndarray | None) -> None:
+def _write_maps(job: Job, capture: CaptureReader, fit: FitResult, albedo: np.ndarray | None) -> None:
     """Write the corrected materials of every view."""
     base, segmentation = read_base(job), job.read("segmentation")
     for done, view in enumerate(capture.views):
         file = f"maps/{view.name}.exr"
         object_id = ids_from_disk(segmentation.exr(file)["object.id"]).ravel().astype(np.int64)
-        values, maps = base_maps(job, view), base.exr(file)
+        maps = base.exr(file)
+        values = base_channels(maps)
         deviation = maps["uncertainty.albedo"].ravel().astype(np.float32)
         fitted = apply_affines(fit.affine, object_id, values).astype(np.float32)
         spread = albedo_uncertainty(fit.affine, fit.covariance, object_id, values, np.repeat(deviation[:, None], 3, 1))
@@ -109,7 +131,7 @@ def write_maps(job: Job, capture: CaptureReader, fit: FitResult, albedo: np.ndar
         job.progress(done + 1, len(capture.views), "views written")
 
 
-def plan_of_fit(
+def _plan_of_fit(
     problem: FitProblem,
     fit: FitResult,
     calibration: dict[str, Any],

@@ -15,7 +15,7 @@ from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_gains, sensor_bounds
 from workflow.scene.cached_light import read_diffuse, read_specular
 from workflow.scene.decoded import DecodedViews
-from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.normal_form import View
 
 BORDER_WEIGHT = 0.1
 """Weight of a pixel on the border of an object."""
@@ -30,9 +30,8 @@ class CellPixels:
         diffuse: (B, 3) mean diffuse light of the blocks.
     """
 
-    def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray, block_of: np.ndarray, blocks: int):
-        self.job, self.capture, self.scene, self.mixed, self.block_of = job, capture, scene, mixed, block_of
-        self.decoded = DecodedViews(capture, job.read("segmentation"))
+    def __init__(self, job: Job, decoded: DecodedViews, scene: BaseScene, mixed: np.ndarray, block_of: np.ndarray, blocks: int):
+        self.job, self.decoded, self.scene, self.mixed, self.block_of = job, decoded, scene, mixed, block_of
         require_denoiser()
         self.levels = len(roughness_levels(job))
         light, samples, self.count = BlockLight(blocks), [np.zeros(0)], 0
@@ -50,7 +49,7 @@ class CellPixels:
 
     def _views(self, diffuse: np.ndarray | None) -> Iterator[tuple[PixelRows, np.ndarray]]:
         """Yield rows and cells with the diffuse light of blocks; if None, with the diffuse light of the pixels, without lobes."""
-        job, capture, gains = self.job, self.capture, read_gains(self.job)
+        job, capture, gains = self.job, self.decoded.capture, read_gains(self.job)
         views = capture.used
         for done, view in enumerate(views):
             pixels = self.decoded.pixels(view, self.scene.normals)
@@ -70,7 +69,10 @@ class CellPixels:
                 d = balanced(d, balance)
             s0, s1 = balanced(s0, balance), balanced(s1, balance)
             weight = np.where(pixels.interior, 1.0, BORDER_WEIGHT)
-            yield PixelRows(block, weight, d, s0, s1, value, exposure, saturated), cell
+            rows = PixelRows(
+                cell=block, weight=weight, diffuse=d, s0=s0, s1=s1, value=value, exposure=exposure, saturated=saturated
+            )
+            yield rows, cell
             job.progress(done + 1, len(views), "views read")
 
 

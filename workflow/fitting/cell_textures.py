@@ -15,7 +15,7 @@ from iif_core.surface.cells import neighbour_pairs, pack_keys
 from workflow.fitting.cell_pixels import CellPixels
 from workflow.fitting.inputs import roughness_levels
 from workflow.runtime.job import Job
-from workflow.scene.normal_form import CaptureReader
+from workflow.scene.decoded import DecodedViews
 
 
 def _points(job: Job) -> np.ndarray:
@@ -34,12 +34,12 @@ class CellTextures:
     levels: np.ndarray
 
     @classmethod
-    def of(cls, job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray) -> CellTextures | None:
+    def of(cls, job: Job, decoded: DecodedViews, scene: BaseScene, mixed: np.ndarray) -> CellTextures | None:
         """Read them, or return None where the settings do not ask for them; `mixed` as in `CellPixels`."""
         cells = len(scene.cell_object)
         if not job.settings.affines.textured or not cells:
             return None
-        views = CellPixels(job, capture, scene, mixed, np.arange(cells), cells)
+        views = CellPixels(job, decoded, scene, mixed, np.arange(cells), cells)
         views.diffuse = smooth_light(views.diffuse, _points(job), scene.cell_object)
         return cls(job, scene, views, roughness_levels(job))
 

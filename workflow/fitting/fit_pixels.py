@@ -17,17 +17,17 @@ _STREAM = 0x616666
 
 
 def count_eligible(pixels: ViewPixels, mixed: np.ndarray, n_objects: int) -> np.ndarray:
-    """Return how many interior pixels of a view may enter the fit, of each object (O,). `mixed` as in `FitPixels`."""
+    """Return how many interior pixels of a view may enter the fit, of each object (O,). `mixed` as in `PixelDraw`."""
     use = _eligible(pixels, mixed) & pixels.interior
     return np.bincount(pixels.object_id[use], minlength=max(n_objects, 1))
 
 
 def _eligible(pixels: ViewPixels, mixed: np.ndarray) -> np.ndarray:
-    return pixels.valid & (pixels.object_id >= 0) & ~mixed[pixels.face]
+    return pixels.valid & pixels.of_object & ~mixed[pixels.face]
 
 
 @dataclass(frozen=True)
-class FitPixels:
+class PixelDraw:
     """A draw of pixels, the same number from each object. A larger draw with the same seed contains a smaller one.
 
     Attributes:
@@ -42,7 +42,7 @@ class FitPixels:
     seed: int
 
     @classmethod
-    def evenly(cls, counts: np.ndarray, budget: int, mixed: np.ndarray, seed: int) -> FitPixels:
+    def evenly(cls, counts: np.ndarray, budget: int, mixed: np.ndarray, seed: int) -> PixelDraw:
         """Draw about `budget` pixels, given the number of eligible ones of each object, (O,)."""
         return cls(mixed, counts < THIN_PIXELS, fair_shares(counts, budget), seed)
 

@@ -94,8 +94,8 @@ class Correction:
 
         for i, albedo in zip(first, map_in_order(albedo_of, len(first), threads), strict=True):
             view = self.views[i]
-            use = view.used & ~view.saturated
-            row = np.searchsorted(group, view.group[use])
+            use = view.valid & ~view.saturated
+            row = np.searchsorted(group, view.object_id[use])
             count += np.bincount(row, minlength=len(group))
             for c in range(3):
                 total[:, c] += np.bincount(row, np.log(albedo[use][:, c]), len(group))

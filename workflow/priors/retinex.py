@@ -33,20 +33,20 @@ class Retinex:
         """Make K predictions of a view."""
         own = self.views.of(view)
         log_light = None
-        hit = (own.depth > 0).ravel()
+        hit = own.hit.ravel()
         if self.light is not None:
             log_light = np.zeros((len(REACHES), hit.size, 3))
             if hit.any():
-                log_light[:, hit] = self.light.log_at(*self.light.around(own)) + np.log(own.exposure)
+                log_light[:, hit] = self.light.log_at(*self.light.around(own)) + np.log(own.camera.exposure)
                 log_light[:, ~hit] = log_light[:, hit].mean(1, keepdims=True)
             log_light = log_light.reshape(len(REACHES), *own.depth.shape, 3)
         maps = retinex_predictions(
-            own.linear,
+            own.value,
             self.settings.samples,
             MEAN_ALBEDO,
-            own.group,
+            own.object_id,
             own.normals,
-            (own.used | ~hit.reshape(own.depth.shape)) & ~own.saturated,
+            (own.valid | ~hit.reshape(own.depth.shape)) & ~own.saturated,
             log_light,
             self.seed,
         )

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache
+from dataclasses import replace
+from functools import cached_property
 from types import SimpleNamespace
 
 import numpy as np
 
 from iif_core.camera.calibration.choice import calibrate_response
 from iif_core.camera.overlap import PatchRows, join_rows, patch_edge, patch_numbers, patch_rows
+from iif_core.camera.pixels import ViewMaps
 from iif_core.camera.response import Response
 from iif_core.light.irradiance import Trace
-from iif_core.priors.features import ViewArrays, borders, surface_points
+from iif_core.priors.features import borders
 from iif_core.surface.cells import grid_origin
 from iif_core.surface.triangles import face_geometry, towards_viewer
 from workflow.runtime import device
+from workflow.scene.decoded import DecodedViews, Kept
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.photograph import GAMMA
 from workflow.segmentations.geometry import pieces
@@ -23,8 +26,8 @@ from workflow.segmentations.surface import Surface
 SATURATED = 0.99  # sensor value
 FAMILY = "spline"
 """Curve of the response: the richest, because there is no choice to make yet (stage emission makes it)."""
-VIEW_MEMORY, BYTES = 1 << 29, 40
-"""Bytes of views that are kept in memory, and bytes of a pixel."""
+MEMORY_MB = 256.0
+"""Megabytes of decoded files that are kept in memory, and as many of views."""
 PATCH_PIXELS = 4_000_000
 """Photographs are thinned to about this many pixels for the response."""
 PIECES = SimpleNamespace(scale=0.05, min_faces=100, min_area=0.01, colour=0.1)
@@ -47,30 +50,30 @@ class CaptureViews:
         self.face_normals, _ = face_geometry(self.vertices, self.faces)
         given = capture.faces()["instance_id"].astype(np.int64)
         by_face = objects_given and bool((given >= 0).any())
-        self.face_group = given if by_face else pieces(Surface(capture), PIECES).astype(np.int64)
+        self.decoded, self._kept = DecodedViews(capture, memory_mb=MEMORY_MB), Kept(MEMORY_MB)
+        self.face_group = given if by_face else pieces(Surface(capture, decoded=self.decoded), PIECES).astype(np.int64)
         self.number = {view.view_id: i for i, view in enumerate(self.views)}
-        most = max((view.width * view.height for view in self.views), default=1) // factor**2 + 1
-        self._kept = lru_cache(max(VIEW_MEMORY // (BYTES * most), 1))(self._of)
         self.exposure = np.array([view.exposure if view.exposure > 1e-6 else 1.0 for view in self.views])
         self.response: Response | None = None
 
     def __len__(self) -> int:
         return len(self.views)
 
-    def __getitem__(self, index: int) -> ViewArrays:
+    def __getitem__(self, index: int) -> ViewMaps:
         return self.of(self.views[index])
 
-    def of(self, view: View) -> ViewArrays:
+    def of(self, view: View) -> ViewMaps:
         """Read one photograph; an 8-bit one becomes linear by the response, or by the power 2.2 as long as there is none."""
-        return self._kept(self.number[view.view_id], self.factor)
+        return self._kept.once(view.view_id, lambda: self._of(self.number[view.view_id], self.factor))
 
-    def full(self, view: View) -> ViewArrays:
+    def full(self, view: View) -> ViewMaps:
         """Read one photograph at its own size."""
         return self._of(self.number[view.view_id], 1)
 
-    def _of(self, number: int, f: int) -> ViewArrays:
+    def _of(self, number: int, f: int) -> ViewMaps:
         capture, view = self.capture, self.views[number]
-        photo, valid = capture.photo(view)
+        own = self.decoded.maps(view)
+        photo, valid, depth, face = own.value, own.valid, own.depth, own.face
         saturated = np.zeros(photo.shape[:2], bool)
         exposure = 1.0
         if not capture.is_hdr:
@@ -78,26 +81,26 @@ class CaptureViews:
             photo = np.clip(photo, 0, 1)
             photo = photo**GAMMA if self.response is None else self._linear(photo)
             exposure = float(self.exposure[number])
-        depth, face = capture.gbuffer(view)
         directions = view.directions()
         group = capture.given_instances(view) if self.objects_given else None
         valid = valid & np.isfinite(photo).all(-1)
-        intrinsics = np.array([view.fx, view.fy, view.cx, view.cy])
+        camera = replace(view, exposure=exposure)
         if f > 1:
             photo, valid, saturated = _means(photo, valid, f), _any(valid, f), _any(saturated, f)
             depth, face, directions = (_middles(array, f) for array in (depth, face, directions))
             group = None if group is None else _middles(group, f)
             # The middle pixel of a block lies at the middle of a smaller pixel.
-            intrinsics = np.r_[intrinsics[:2] / f, (intrinsics[2:] - (f // 2 + 0.5)) / f + 0.5]
-        hit = (face >= 0) & (depth > 0)
+            middle = {name: (getattr(view, name) - (f // 2 + 0.5)) / f + 0.5 for name in ("cx", "cy")}
+            camera = replace(camera, width=depth.shape[1], height=depth.shape[0], fx=view.fx / f, fy=view.fy / f, **middle)
+        made = ViewMaps(camera=camera, value=photo, valid=valid, depth=depth, face=face, saturated=saturated)
+        hit = made.hit
         towards = -directions / np.linalg.norm(directions, axis=-1, keepdims=True)
         normals, _ = towards_viewer(self.face_normals[face].reshape(-1, 3), towards.reshape(-1, 3))
         normals = np.where(hit[..., None], normals.reshape(*hit.shape, 3), 0)
         if group is None:
             group = np.where(hit, self.face_group[face], -1)
-        depth = np.where(hit, depth, 0).astype(np.float32)
-        surface = depth, normals.astype(np.float32), group.astype(np.int32)
-        return ViewArrays(photo, hit & valid, saturated, *surface, view.world_from_camera, intrinsics, exposure)
+        surface = {"normals": normals.astype(np.float32), "object_id": group.astype(np.int32)}
+        return replace(made, valid=hit & valid, depth=np.where(hit, depth, 0).astype(np.float32), **surface)
 
     def _linear(self, photo: np.ndarray) -> np.ndarray:
         """Invert the response, by a table of a sixteenth of the steps of 8-bit values."""
@@ -122,7 +125,7 @@ class CaptureViews:
         given = not self.capture.facts.get("exposure_estimated", False)
         found = calibrate_response(self._shared_surface(), self.exposure, (FAMILY,), SATURATED, given)
         self.exposure = np.asarray(found.exposure, np.float64)
-        self._kept.cache_clear()
+        self._kept.forget()
         if not found.rows:
             return f"{found.reason.split(':')[0]}: taken as the power {GAMMA}"
         self.response = found.response
@@ -134,8 +137,8 @@ class CaptureViews:
         for i in range(len(self)):
             own = self[i]
             pixels += own.depth.size
-            if (hit := own.depth > 0).any():
-                footprints.append(float(np.median(own.depth[hit])) / float(own.intrinsics[0]))
+            if (hit := own.hit).any():
+                footprints.append(float(np.median(own.depth[hit])) / own.camera.fx)
         corners = self.vertices[np.unique(self.faces)]
         extent = float(np.ptp(corners, axis=0).max())
         edge = patch_edge(float(np.median(footprints)), extent) if footprints else max(extent, 1.0)
@@ -145,10 +148,10 @@ class CaptureViews:
         for number, view in enumerate(self.views):
             own = self.of(view)
             # The response applies to single sensor values, not to means, so the middle pixel stands for its block.
-            value, valid = (_middles(array, self.factor) for array in self.capture.photo(view))
-            use = own.used & valid & ~borders(own.group)
-            group = own.group[use]
-            patch = patch_numbers(surface_points(own)[use], group, edge, origin)
+            value, valid = (_middles(array, self.factor) for array in self.decoded.photo(view))
+            use = own.valid & valid & ~borders(own.object_id)
+            group = own.object_id[use]
+            patch = patch_numbers(own.points()[use], group, edge, origin)
             parts.append(patch_rows(patch, own.normals[use], group, value[use], number, SATURATED, share=share))
         return join_rows(parts)
 

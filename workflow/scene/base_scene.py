@@ -77,7 +77,11 @@ def sensor_bounds(value: np.ndarray, is_hdr: bool) -> tuple[np.ndarray, np.ndarr
 
 def base_maps(job: Job, view: View) -> np.ndarray:
     """Read the base albedo, roughness and metallic of a view, (H * W, 5) float32."""
-    maps = read_base(job).exr(f"maps/{view.name}.exr")
+    return base_channels(read_base(job).exr(f"maps/{view.name}.exr"))
+
+
+def base_channels(maps: dict[str, np.ndarray]) -> np.ndarray:
+    """Return albedo, roughness and metallic of maps of stage base, (H * W, 5) float32."""
     parts = [rgb(maps, "albedo"), maps["roughness"][..., None], maps["metallic"][..., None]]
     return np.concatenate(parts, -1).reshape(-1, 5).astype(np.float32)
 

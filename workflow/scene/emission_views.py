@@ -10,7 +10,7 @@ from iif_core.light.emission.photographs import SEEDS, ViewRecord
 from workflow.decisions import camera as decisions
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import base_maps
-from workflow.scene.decoded import DecodedViews
+from workflow.scene.decoded import DecodedViews, Kept
 from workflow.scene.normal_form import CaptureReader, View
 
 VIEW_MEMORY_MB = 1024.0
@@ -22,32 +22,24 @@ class ViewRecords:
 
     Where the photographs have more pixels than `most` in all, a record is of a random choice of those of its view, the same
     share of every view; nothing but `seen` and `median_depth` is then of the whole view.
-
-    Passes visit the views in the same order, so the first views are kept and the later ones are decoded again.
     """
 
     def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene, most: int):
-        self.job, self.scene, self.views = job, scene, DecodedViews(capture, job.read("segmentation"), 0)
+        self.job, self.scene = job, scene
+        # Records are kept, not the files that they are made of.
+        self.decoded, self._kept = DecodedViews(capture, job.read("segmentation"), 0), Kept(VIEW_MEMORY_MB)
         self.share = min(1.0, most / max(sum(view.width * view.height for view in capture.used), 1))
-        self._kept: dict[int, ViewRecord] = {}
-        self._megabytes = 0.0
 
     def __getitem__(self, view: View) -> ViewRecord:
-        record = self._kept.get(view.view_id)
-        if record is None:
-            record = self._decoded(view)
-            if self._megabytes + record.megabytes <= VIEW_MEMORY_MB:
-                self._kept[view.view_id] = record
-                self._megabytes += record.megabytes
-        return record
+        return self._kept.once(view.view_id, lambda: self._record(view))
 
-    def _decoded(self, view: View) -> ViewRecord:
+    def _record(self, view: View) -> ViewRecord:
         among = None
         if self.share < 1:
             rng = np.random.default_rng([self.job.seed, SEEDS, 5, view.view_id])
             among = rng.random((view.height, view.width)) < self.share
         base = None if view.split == "test" else base_maps(self.job, view)
-        return ViewRecord.of(view, self.views.decoded(view), self.scene.normals, base, among)
+        return ViewRecord.of(self.decoded.maps(view), self.scene.normals, base, among)
 
 
 def view_exposures(capture: CaptureReader, notes: list[str]) -> CameraGains:

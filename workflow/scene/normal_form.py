@@ -219,5 +219,4 @@ class CaptureReader:
 
     def points(self, view: View, depth: np.ndarray) -> np.ndarray:
         """Return (H, W, 3) float32 surface points in metres; they mean nothing where the depth is 0."""
-        origin = view.world_from_camera[:3, 3]
-        return (origin + depth[..., None] * view.directions()).astype(np.float32)
+        return view.points(depth)

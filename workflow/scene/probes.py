@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from iif_core.camera.pinhole import project
+from iif_core.camera.pixels import ViewMaps
 from iif_core.camera.response import SATURATION
 from iif_core.errors import InputError
 from iif_core.numerics.color import linear_from_srgb
@@ -15,8 +16,10 @@ from iif_core.numerics.frames import dominant_side
 from iif_core.numerics.xp import NUMPY
 from iif_core.reflectance import brdf
 from iif_core.requirements.probes import MAX_POINTS, GlossRows, LightRows
+from iif_core.surface.triangles import towards_viewer
 from workflow.runtime.job import Job
-from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.decoded import DecodedViews
+from workflow.scene.normal_form import CaptureReader
 
 if TYPE_CHECKING:
     from iif_core.light.transport.geometry import Geometry
@@ -48,27 +51,15 @@ BORDER = 2
 """Pixels around a point that must show nothing else."""
 
 
-@dataclass(frozen=True)
-class ViewRadiance:
-    """One photograph as radiance: `radiance` (H, W, 3), `usable` and `saturated` (H, W), z-depth and face (H, W)."""
-
-    view: View
-    radiance: np.ndarray
-    usable: np.ndarray
-    saturated: np.ndarray
-    depth: np.ndarray
-    face: np.ndarray
-
-
-def read_radiance(capture: CaptureReader, view: View) -> ViewRadiance:
-    """Read a photograph; 8-bit values become radiance by the sRGB curve and the exposure, which no probe improves on."""
-    value, valid = capture.photo(view)
-    depth, face = capture.gbuffer(view)
-    exposure = view.exposure if 0 < view.exposure < np.inf else 1.0  # docs/method/numerics.md#exposure-at-zero
-    if capture.is_hdr:
-        return ViewRadiance(view, value / exposure, valid, np.zeros(valid.shape, bool), depth, face)
-    radiance = linear_from_srgb(np.clip(value, 0, 1)).astype(np.float32) / exposure
-    return ViewRadiance(view, radiance, valid, valid & (value.max(-1) >= SATURATION), depth, face)
+def as_radiance(maps: ViewMaps, is_hdr: bool) -> ViewMaps:
+    """Return a view whose values are radiance, with its `saturated`; 8-bit values become radiance by the sRGB curve and the
+    exposure, which no probe improves on."""
+    exposure = maps.camera.exposure
+    exposure = exposure if 0 < exposure < np.inf else 1.0  # docs/method/numerics.md#exposure-at-zero
+    if is_hdr:
+        return replace(maps, value=maps.value / exposure, saturated=np.zeros(maps.valid.shape, bool))
+    radiance = linear_from_srgb(np.clip(maps.value, 0, 1)).astype(np.float32) / exposure
+    return replace(maps, value=radiance, saturated=maps.valid & (maps.value.max(-1) >= SATURATION))
 
 
 @dataclass(frozen=True)
@@ -104,7 +95,7 @@ def _keys(points: np.ndarray, low: np.ndarray, edge: float) -> np.ndarray:
     return (i << 42) | (j << 21) | k
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Points:
     """Surface points of a probe: position and unit normal towards the viewer (n, 3), radiance (n, 3), number of the view in the
     probe (n,), whether its neighbourhood is of one brightness (n,), `group` of surface and `block` (n,)."""
@@ -139,8 +130,9 @@ def probe_rows(job: Job, capture: CaptureReader, geometry: Geometry) -> ProbeRow
     """
     rng = np.random.default_rng([job.seed, _SEEDS])
     views = capture.used[:: max(1, -(-len(capture.used) // MAX_VIEWS))]
-    photos = [read_radiance(capture, view) for view in views]
-    depth = np.concatenate([photo.depth[photo.usable & (photo.face >= 0)] for photo in photos])
+    decoded = DecodedViews(capture, memory_mb=0)  # each file is read once, and all photographs stay in memory as radiance
+    photos = [as_radiance(decoded.maps(view), capture.is_hdr) for view in views]
+    depth = np.concatenate([photo.depth[photo.valid & photo.hit] for photo in photos])
     if not len(depth):
         raise InputError(
             "plan: no usable pixel of any photograph shows the mesh; compare poses and mesh (`alignment` in"
@@ -150,8 +142,8 @@ def probe_rows(job: Job, capture: CaptureReader, geometry: Geometry) -> ProbeRow
     table = _table(photos, edge, rng)
     points = _draw(photos, geometry, _given_objects(job, capture), table, rng)
     light, secondary, photographed = _light_rows(points, geometry, table, rng)
-    missed = np.array([np.count_nonzero(p.usable & (p.face < 0)) for p in photos])
-    counted = sum(np.count_nonzero(p.usable) for p in photos)
+    missed = np.array([np.count_nonzero(p.valid & ~p.hit) for p in photos])
+    counted = sum(np.count_nonzero(p.valid) for p in photos)
     sky, inside = (_mean_radiance(photos, hit) for hit in (False, True))
     gloss = _gloss_rows(points, photos, geometry, table, sky, rng)
     outside = sky / max(inside, 1e-12) if missed.any() else None
@@ -165,42 +157,40 @@ def _given_objects(job: Job, capture: CaptureReader) -> np.ndarray:
     return np.full(len(capture.faces()["face_id"]), -1, np.int32)
 
 
-def _mean_radiance(photos: list[ViewRadiance], hit: bool) -> float:
+def _mean_radiance(photos: list[ViewMaps], hit: bool) -> float:
     """Return the mean radiance of what camera rays meet, or of where they miss; 0 without such pixels."""
-    found = [photo.radiance[photo.usable & ((photo.face >= 0) == hit)].mean(-1) for photo in photos]
+    found = [photo.value[photo.valid & (photo.hit == hit)].mean(-1) for photo in photos]
     every = np.concatenate(found)
     return float(every.mean()) if len(every) else 0.0
 
 
-def _table(photos: list[ViewRadiance], edge: float, rng: np.random.Generator) -> RadianceTable:
+def _table(photos: list[ViewMaps], edge: float, rng: np.random.Generator) -> RadianceTable:
     points, radiance, saturated = [], [], []
     for photo in photos:
-        index = np.flatnonzero((photo.usable & (photo.face >= 0)).ravel())
+        index = np.flatnonzero(photo.valid & photo.hit)
         index = rng.choice(index, min(len(index), CACHE_PIXELS), replace=False)
-        origin = photo.view.world_from_camera[:3, 3]
-        ways = photo.view.directions().reshape(-1, 3)[index]
-        points.append(origin + photo.depth.ravel()[index, None] * ways)
-        radiance.append(photo.radiance.reshape(-1, 3)[index])
+        points.append(photo.points(np.float64).reshape(-1, 3)[index])
+        radiance.append(photo.value.reshape(-1, 3)[index])
         saturated.append(photo.saturated.ravel()[index])
     return RadianceTable.of(np.concatenate(points), np.concatenate(radiance), np.concatenate(saturated), edge)
 
 
 def _draw(
-    photos: list[ViewRadiance], geometry: Geometry, instance: np.ndarray, table: RadianceTable, rng: np.random.Generator
+    photos: list[ViewMaps], geometry: Geometry, instance: np.ndarray, table: RadianceTable, rng: np.random.Generator
 ) -> Points:
     """Draw points evenly over the photographs, away from edges of the mesh and from what is saturated or black."""
     each = MAX_POINTS // len(photos)
     parts: dict[str, list[np.ndarray]] = {name: [] for name in ("position", "normal", "radiance", "view", "even", "face")}
     for number, photo in enumerate(photos):
-        good = photo.usable & ~photo.saturated & (photo.face >= 0) & (photo.radiance.mean(-1) > 0) & _even(photo, False)
+        good = photo.valid & ~photo.saturated & photo.hit & (photo.value.mean(-1) > 0) & _even(photo, False)
         index = np.flatnonzero(good.ravel())
         index = rng.choice(index, min(len(index), each), replace=False)
-        way = photo.view.directions().reshape(-1, 3)[index]
+        towards = -photo.camera.directions().reshape(-1, 3)[index]
         face = photo.face.ravel()[index]
-        normal = geometry.normals[face]
-        parts["position"].append(photo.view.world_from_camera[:3, 3] + photo.depth.ravel()[index, None] * way)
-        parts["normal"].append(np.where((normal * way).sum(1, keepdims=True) > 0, -normal, normal))
-        parts["radiance"].append(photo.radiance.reshape(-1, 3)[index])
+        parts["position"].append(photo.points(np.float64).reshape(-1, 3)[index])
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        parts["normal"].append(towards_viewer(geometry.normals[face], towards)[0])
+        parts["radiance"].append(photo.value.reshape(-1, 3)[index])
         parts["view"].append(np.full(len(index), number))
         parts["even"].append(_even(photo, True).ravel()[index])
         parts["face"].append(face)
@@ -214,15 +204,15 @@ def _draw(
     return Points(**joined, group=np.unique(group, return_inverse=True)[1], block=block)
 
 
-def _even(photo: ViewRadiance, light: bool) -> np.ndarray:
+def _even(photo: ViewMaps, light: bool) -> np.ndarray:
     """(H, W) bool: the neighbourhood is at one depth, and not at the border; with `light` also of one brightness. What is
     photographed is then the surface in the middle of the pixel alone."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     size = 2 * BORDER + 1
-    images = [(np.where(photo.face >= 0, photo.depth, 0), DEPTH_RANGE)]
+    images = [(np.where(photo.hit, photo.depth, 0), DEPTH_RANGE)]
     if light:
-        images.append((np.where(photo.usable & ~photo.saturated, photo.radiance.mean(-1), 0), BRIGHTNESS_RANGE))
+        images.append((np.where(photo.valid & ~photo.saturated, photo.value.mean(-1), 0), BRIGHTNESS_RANGE))
     even = np.ones(photo.depth.shape, bool)
     for image, ratio in images:
         low, high = minimum_filter(image, size, mode="constant"), maximum_filter(image, size, mode="constant")
@@ -251,19 +241,19 @@ def _light_rows(
     hits = hit.reshape(-1, RAYS).sum(1)
     use = seen >= LEAST_SEEN * hits
     rows = LightRows(
-        points.radiance.mean(1)[use],
-        (known.reshape(-1, RAYS).sum(1) * share)[use],
-        (saturated.reshape(-1, RAYS).sum(1) * share)[use],
-        1.0 - hits[use] / RAYS,
-        points.group[use],
-        points.block[use],
+        radiance=points.radiance.mean(1)[use],
+        known=(known.reshape(-1, RAYS).sum(1) * share)[use],
+        saturated=(saturated.reshape(-1, RAYS).sum(1) * share)[use],
+        escaping=1.0 - hits[use] / RAYS,
+        group=points.group[use],
+        block=points.block[use],
     )
     return rows, float((~hit).mean()) if len(hit) else 0.0, float((row[hit] >= 0).mean()) if hit.any() else 0.0
 
 
 def _gloss_rows(
     points: Points,
-    photos: list[ViewRadiance],
+    photos: list[ViewMaps],
     geometry: Geometry,
     table: RadianceTable,
     sky: float,
@@ -277,24 +267,29 @@ def _gloss_rows(
     rank = np.arange(len(point)) - np.searchsorted(point, point)
     keep = rank < PAIRS
     point, value, view = point[keep], value[keep], view[keep]
-    eyes = np.stack([photo.view.world_from_camera[:3, 3] for photo in photos])
+    eyes = np.stack([photo.camera.world_from_camera[:3, 3] for photo in photos])
     each = np.arange(len(points.view))
     uniform = rng.random((2, LOBE_RAYS))  # the same for all points, so that differences between views keep little noise
     own = _lobes(points, each, eyes[points.view], geometry, table, sky, uniform)
     other = _lobes(points, point, eyes[view], geometry, table, sky, uniform)
     pair = np.stack([points.radiance.mean(1)[point], value], 1)
     mean = pair.mean(1)
-    numbers = np.stack([points.view[point], view], 1)
-    lobes = np.stack([own[point], other], 1) / mean[:, None, None]
-    return GlossRows(pair / mean[:, None], lobes, numbers, point, points.group[point], points.block[point])
+    return GlossRows(
+        radiance=pair / mean[:, None],
+        lobes=np.stack([own[point], other], 1) / mean[:, None, None],
+        view=np.stack([points.view[point], view], 1),
+        point=point,
+        group=points.group[point],
+        block=points.block[point],
+    )
 
 
-def _seen_in(points: Points, number: int, photo: ViewRadiance) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _seen_in(points: Points, number: int, photo: ViewMaps) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the points of other photographs that this one shows: their rows, what it shows (mean of the channels), and its
     number."""
     from scipy.ndimage import map_coordinates
 
-    v = photo.view
+    v = photo.camera
     u, w, z = project(points.position, v.fx, v.fy, v.cx, v.cy, v.world_from_camera)
     x, y = np.floor(u), np.floor(w)
     towards = v.world_from_camera[:3, 3] - points.position
@@ -302,9 +297,9 @@ def _seen_in(points: Points, number: int, photo: ViewRadiance) -> tuple[np.ndarr
     inside = facing & (z > 0) & (x >= 0) & (y >= 0) & (x < v.width) & (y < v.height) & (points.view != number) & points.even
     row = np.flatnonzero(inside)
     at = (y[row].astype(int), x[row].astype(int))
-    good = photo.usable[at] & ~photo.saturated[at] & _even(photo, True)[at]
+    good = photo.valid[at] & ~photo.saturated[at] & _even(photo, True)[at]
     good &= np.abs(photo.depth[at] - z[row]) < DEPTH_TOLERANCE * z[row]
-    value = map_coordinates(photo.radiance.mean(-1), [w[row] - 0.5, u[row] - 0.5], order=1, mode="nearest")
+    value = map_coordinates(photo.value.mean(-1), [w[row] - 0.5, u[row] - 0.5], order=1, mode="nearest")
     good &= value > 0
     return row[good], value[good], np.full(int(good.sum()), number)
 

@@ -52,12 +52,11 @@ def mean_face_colour(surface: Surface, fold: int | None = None) -> tuple[np.ndar
     capture, count = surface.capture, len(surface.faces)
     total, pixels = np.zeros((count, 3)), np.zeros(count)
     for view in surface.views(fold):
-        photo, valid = capture.photo(view)
-        face = capture.gbuffer(view)[1]
-        used = valid & (face >= 0)
+        maps = surface.decoded.maps(view)
+        used = maps.valid & maps.hit
         if not used.any():
             continue
-        values, face = photo[used].astype(np.float64), face[used]
+        values, face = maps.value[used].astype(np.float64), maps.face[used]
         if capture.is_hdr:
             values = values / (values + max(float(values.mean()), 1e-12))
         else:

@@ -46,7 +46,7 @@ def _by_view(surface: Surface, fold: int | None) -> Objects:
     for view in surface.views(fold):
         given = surface.capture.given_instances(view)
         if given is not None:
-            face_ids.append(surface.capture.gbuffer(view)[1].ravel())
+            face_ids.append(surface.decoded.gbuffer(view)[1].ravel())
             instance_ids.append(given.ravel())
     if not face_ids:
         raise InputError(

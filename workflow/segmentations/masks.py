@@ -16,7 +16,8 @@ from iif_core.objects.options import ConsensusOptions, PieceOptions
 from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
 from iif_core.surface.segments import fill_within
 from workflow.runtime.job import Job
-from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.decoded import DecodedViews
+from workflow.scene.normal_form import View
 from workflow.segmentations import sam2
 from workflow.segmentations.geometry import pieces
 from workflow.segmentations.mask_files import MaskFiles, mask_files
@@ -89,13 +90,12 @@ def cluster_views(surface: Surface, views: list[View], load: Load, options: Cons
     Raises:
         InputError: no mask covers enough surface points.
     """
-    capture = surface.capture
-    edge = POINT_FOOTPRINTS * _footprint(capture, views)
-    points = surface_points(capture, views, edge)
+    edge = POINT_FOOTPRINTS * _footprint(surface.decoded, views)
+    points = surface_points(surface, views, edge)
     seen = []
     for view in views:
         camera = (view.fx, view.fy, view.cx, view.cy)
-        seen.append(masks_at(points, load(view), capture.gbuffer(view)[0], camera, view.world_from_camera, edge))
+        seen.append(masks_at(points, load(view), surface.decoded.gbuffer(view)[0], camera, view.world_from_camera, edge))
     masks = gather_masks(seen, len(points), options.min_points)
     if not len(masks.view):
         raise InputError(
@@ -150,9 +150,9 @@ def _part_and_join(
     code, fragment = np.unique(label.astype(np.int64) * pieces_in_all + piece, return_inverse=True)
 
     def pixels(view: View) -> tuple[np.ndarray, np.ndarray]:
-        labels, face = load(view), surface.capture.gbuffer(view)[1]
-        masked = (face >= 0) & (labels > 0)
-        return fragment[face[masked]], labels[masked]
+        labels, maps = load(view), surface.decoded.maps(view, photograph=False)
+        masked = maps.hit & (labels > 0)
+        return fragment[maps.face[masked]], labels[masked]
 
     seen = sightings(pixels(view) for view in views)
     elected = code // pieces_in_all
@@ -162,38 +162,38 @@ def _part_and_join(
     return united[fragment], between - before, between - after
 
 
-def surface_points(capture: CaptureReader, views: list[View], edge: float) -> np.ndarray:
+def surface_points(surface: Surface, views: list[View], edge: float) -> np.ndarray:
     """Return surface points (n, 3) float32 that photographs show, one per voxel of `edge` metres: the first that was seen."""
     keys, points = np.zeros(0, np.uint64), np.zeros((0, 3), np.float32)
-    origin = grid_origin(capture.mesh()[0], edge)
+    origin = grid_origin(surface.vertices, edge)
     for view in views:
-        depth = capture.gbuffer(view)[0]
-        here = capture.points(view, depth)[depth > 0]
+        maps = surface.decoded.maps(view, photograph=False)
+        here = maps.points()[maps.hit]
         keys = np.concatenate([keys, pack_keys(voxel_indices(here, edge, origin))])
         keys, first = np.unique(keys, return_index=True)
         points = np.concatenate([points, here])[first]
     return points
 
 
-def _footprint(capture: CaptureReader, views: list[View]) -> float:
+def _footprint(decoded: DecodedViews, views: list[View]) -> float:
     """Return the median size of a pixel on the surface, in metres."""
     sizes = []
     for view in views:
-        depth = capture.gbuffer(view)[0]
-        sizes.append(np.median(depth[depth > 0]) / view.fx)
+        maps = decoded.maps(view, photograph=False)
+        sizes.append(np.median(maps.depth[maps.hit]) / view.fx)
     return float(np.median(sizes))
 
 
 def _votes(surface: Surface, views: list[View], load: Load, masks: MaskPoints, cluster: np.ndarray, gap: float) -> list:
-    capture, origin, out = surface.capture, grid_origin(surface.vertices, gap), []
+    origin, out = grid_origin(surface.vertices, gap), []
     for i, view in enumerate(views):
-        labels, (depth, face) = load(view), capture.gbuffer(view)
-        hit = face >= 0
+        labels, maps = load(view), surface.decoded.maps(view, photograph=False)
+        hit, face = maps.hit, maps.face
         table = np.full(max(int(labels.max()), 0) + 1, -1, np.int32)
         mine = masks.view == i
         table[masks.label[mine]] = cluster[mine]
         label = np.maximum(labels[hit], 0)
         of_pixel = table[label]
-        key = pack_keys(voxel_indices(capture.points(view, depth)[hit], gap, origin), of_pixel)
+        key = pack_keys(voxel_indices(maps.points()[hit], gap, origin), of_pixel)
         out.append(view_votes(face[hit], key, of_pixel >= 0, label > 0, len(surface.faces)))
     return out

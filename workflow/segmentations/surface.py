@@ -10,9 +10,12 @@ import numpy as np
 
 from iif_core.surface.segments import face_adjacency
 from workflow.artifacts.store import StageReader
+from workflow.scene.decoded import DecodedViews
 from workflow.scene.normal_form import CaptureReader, View
 
 FOLDS = 3  # perturbed runs; each leaves out every third photograph
+MEMORY_MB = 256.0
+"""Megabytes of decoded files that are kept: the memory of this stage is to stay small."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +57,12 @@ class Stability:
 class Surface:
     """Mesh, photographs and, if they are there, predictions of a scene.
 
-    Costly properties are cached; plug-ins may cache results in `kept`.
+    Costly properties are cached; plug-ins may cache results in `kept`. `decoded` are the files of the capture.
     """
 
-    def __init__(self, capture: CaptureReader, prior: StageReader | None = None):
+    def __init__(self, capture: CaptureReader, prior: StageReader | None = None, decoded: DecodedViews | None = None):
         self.capture, self.prior = capture, prior
+        self.decoded = DecodedViews(capture, memory_mb=MEMORY_MB) if decoded is None else decoded
         self.kept: dict[str, Any] = {}
         self.vertices, self.faces = capture.mesh()
 
@@ -77,8 +81,8 @@ class Surface:
         """Numbers of pixels that see each face, (m,) for every fold."""
         out = [np.zeros(len(self.faces), np.int64) for _ in range(FOLDS)]
         for i, view in enumerate(self.capture.used):
-            face = self.capture.gbuffer(view)[1]
-            out[i % FOLDS] += np.bincount(face[face >= 0], minlength=len(self.faces))
+            maps = self.decoded.maps(view, photograph=False)
+            out[i % FOLDS] += np.bincount(maps.face[maps.hit], minlength=len(self.faces))
         return out
 
     def pixels(self, fold: int | None = None) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable
 
 import numpy as np
@@ -32,7 +31,6 @@ def run(job: Job, fuse: Callable[[Job, Predictions], None] = fuse) -> None:
     capture = CaptureReader(job.read("capture"))
     with job.timed("predict"):
         predictions = _Predictions(job, capture)
-    gc.collect()  # the views that the network read hold themselves, by their cache
     fuse(job, predictions)
     job.writer.json(SECOND_LOOK, {"made": True, "reason": "prior learned divides the photographs by their light"})
 

@@ -24,7 +24,7 @@ from workflow.decisions import numerics
 from workflow.decisions.materials import METALLIC_PRIOR
 from workflow.decisions.plan import included, matte_by_predictions
 from workflow.decisions.record import PROVISIONAL, Decision
-from workflow.fitting.fit_pixels import FitPixels, count_eligible
+from workflow.fitting.fit_pixels import PixelDraw, count_eligible
 from workflow.runtime import device
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_lit_scene, read_object_gains, read_radiance_cache
@@ -55,7 +55,7 @@ def run(job: Job) -> None:
                 counts[:] += count_eligible(pixels, mixed, scene.n_objects)
 
     cells = cells_of_views(seen(), options.cell_edge, cache_origin(scene, options.cell_edge), options)
-    drawn = None if own.pixels == "all" else FitPixels.evenly(counts, int(own.pixels), mixed, job.seed)
+    drawn = None if own.pixels == "all" else PixelDraw.evenly(counts, int(own.pixels), mixed, job.seed)
     device.mitsuba()
     # Surface outside all photographs is given the object gains that stage emission found.
     geometry, material = scene.with_gains(read_object_gains(job, scene.n_objects)).traceable(light.emits)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ from iif_core.light.emission.environment import Sky, sky_prior
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, BaseAlbedo, GainOptions, ObjectGains
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.hidden import with_hidden_surface
-from iif_core.light.emission.photographs import SEEDS, Photographs, choose_rows, joined, radiance_cache, seen_faces
+from iif_core.light.emission.photographs import SEEDS, Photographs, choose_rows, radiance_cache, seen_faces
 from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import (
     EmissionProblem,
@@ -62,12 +62,13 @@ COMPARED_TILES_ACROSS = 8
 
 
 class SurfacePoints(NamedTuple):
-    """Points whose transport is traced, (n, 3) float32 each: metres, unit normals, unit vectors to where they are seen from; and
-    the numbers (n,) uint32 by which they draw."""
+    """Points of surface that no pixel shows, n of them, as `ViewPixels` has those of pixels: `points`, `normals`, `wo` (n, 3),
+    `base` (n, 5) and `number` (n,)."""
 
     points: np.ndarray
     normals: np.ndarray
     wo: np.ndarray
+    base: np.ndarray
     number: np.ndarray
 
 
@@ -107,11 +108,11 @@ def trial(
     photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, certain: float, threshold: float
 ) -> tuple[PrunedEmission, np.ndarray]:
     """Find which groups emit light, and the albedo gains of objects (n_objects, 3), from half of the rows."""
-    pixels, base, rows = choose_rows(photos, groups, threshold, 2)
+    pixels, rows = choose_rows(photos, groups, threshold, 2)
     own = rows.group >= 0
-    transport = trace_rows(photos, pixels, base, groups, voxels, sky, 0).without_lobes()
+    transport = trace_rows(photos, pixels, groups, voxels, sky, 0).without_lobes()
     paint = np.tile(np.float32(WHITE), (int(own.sum()), 1))
-    white = trace_rows(photos, pixels.take(own), paint, groups, voxels, sky, 1).without_lobes()
+    white = trace_rows(photos, replace(pixels.take(own), base=paint), groups, voxels, sky, 1).without_lobes()
     seen, prior = light_prior(photos, groups, rows, sky)
     n_groups = len(prior.initial)
     problem = assemble(rows, transport, n_groups, white, sky)
@@ -140,11 +141,11 @@ def traced(
     no rows unless they shine.
     """
     cache = radiance_cache(photos, groups) if voxels is None else voxels
-    pixels, base, rows = choose_rows(photos, groups, threshold, 1, tile_edge)
+    pixels, rows = choose_rows(photos, groups, threshold, 1, tile_edge)
     if left_out is not None:
         use = (rows.group >= 0) | ~left_out[pixels.face]
-        pixels, base, rows = pixels.take(use), base[use], rows.take(use)
-    transport = trace_rows(photos, pixels, base, groups, cache, sky, 3, unseen)
+        pixels, rows = pixels.take(use), rows.take(use)
+    transport = trace_rows(photos, pixels, groups, cache, sky, 3, unseen)
     prior = light_prior(photos, groups, rows, sky)[1]
     problem = assemble(rows, transport, len(prior.initial), None, sky)
     problem, found = problem.solve_object_gains(prior, base_albedo(photos, sky), photos.scene.n_objects, options)
@@ -255,10 +256,9 @@ def _raised(
     bounds = pack_keys(cache.ijk[cache.censored])
     if not len(bounds):
         return cache
-    parts, materials = [], []
+    parts = []
     for view in photos.views:
-        record = photos.records[view]
-        pixels = record.pixels
+        pixels = photos.records[view].pixels
         drawn = np.random.default_rng([photos.options.seed, SEEDS, 2, view.view_id]).random(len(pixels.index))
         use = np.flatnonzero(pixels.valid & pixels.interior & (found.groups.of_face[pixels.face] < 0))
         keys = pack_keys(voxel_indices(pixels.points[use], cache.edge, cache.origin))
@@ -267,15 +267,14 @@ def _raised(
         first = use[np.sort(inside[np.unique(keys[inside], return_index=True)[1]])]  # one pixel a voxel and view
         first = first[np.argsort(drawn[first], kind="stable")[: -(-SATURATED_PIXELS // len(photos.views))]]
         parts.append(pixels.take(first))
-        materials.append(record.base[first])
-    pixels, base = joined(parts), np.concatenate(materials)
-    if not len(base):
+    pixels = ViewPixels.joined(parts)
+    if not len(pixels.index):
         return cache
-    transport = trace_rows(photos, pixels, base, found.groups, found.cache, sky, 2, unseen)
+    transport = trace_rows(photos, pixels, found.groups, found.cache, sky, 2, unseen)
     matrix, cached = transport.matrix[:, 0].mean(0), transport.cached[:, 0].mean(0)
     light = light_of(matrix, radiance) + cached
     of_object = np.concatenate([found.gains.gain, np.ones((1, 3))])  # the last for surface of no object, -1
-    possible = 1.0 / np.maximum(base[:, :3], 1e-3)  # no surface reflects more than it receives
+    possible = 1.0 / np.maximum(pixels.base[:, :3], 1e-3)  # no surface reflects more than it receives
     return cache.raised(pixels.points, np.minimum(of_object[pixels.object_id], possible) * light)
 
 
@@ -291,8 +290,8 @@ def _first_look(
     """Trace all groups as columns of one problem, on some of the rows; of the first groups some are `lit`."""
     thin = -(-photos.options.rows // FIRST_LOOK_ROWS)
     cache = radiance_cache(photos, every)
-    pixels, base, rows = choose_rows(photos, every, threshold, thin, comparison_tile(photos))
-    transport = trace_rows(photos, pixels, base, every, cache, sky, 2, unseen)
+    pixels, rows = choose_rows(photos, every, threshold, thin, comparison_tile(photos))
+    transport = trace_rows(photos, pixels, every, cache, sky, 2, unseen)
     white = _white_hidden_surface(photos, every, cache, sky, unseen)
     seen, prior = light_prior(photos, every, rows, sky)
     outside = len(prior.initial) - every.size
@@ -320,10 +319,13 @@ def _white_hidden_surface(
         normal = scene.normals[face] * np.where(np.arange(len(face)) % 2, -1.0, 1.0)[:, None]
         middle = scene.vertices[scene.faces[face]].mean(1) + 1e-3 * normal
         points = SurfacePoints(
-            *(part.astype(np.float32) for part in (middle, normal, normal)), np.arange(len(face), dtype=np.uint32)
+            points=middle.astype(np.float32),
+            normals=normal.astype(np.float32),
+            wo=normal.astype(np.float32),
+            base=np.tile(np.float32(WHITE), (len(face), 1)),
+            number=np.arange(len(face), dtype=np.uint32),
         )
-        paint = np.tile(np.float32(WHITE), (len(face), 1))
-        white = trace_rows(photos, points, paint, groups, voxels, sky, 1, unseen).without_lobes()
+        white = trace_rows(photos, points, groups, voxels, sky, 1, unseen).without_lobes()
         np.add.at(matrix, group, white.matrix[:, 0].mean(0) / (0.5 * HIDDEN_POINTS))
         np.add.at(cached, group, white.cached[:, 0].mean(0) / (0.5 * HIDDEN_POINTS))
     return WhiteSurface(np.zeros((number, 3)), matrix, cached)
@@ -394,7 +396,6 @@ def light_prior(
 def trace_rows(
     photos: Photographs,
     pixels: ViewPixels | SurfacePoints,
-    base: np.ndarray,
     groups: EmitterGroups,
     voxels: RadianceVoxels,
     sky: Sky | None,
@@ -409,7 +410,7 @@ def trace_rows(
 
     options = photos.options
     cache = RadianceCache(voxels.edge, voxels.origin, voxels.ijk, voxels.radiance)
-    metallic = believed_metallic(base)
+    base, metallic = pixels.base, believed_metallic(pixels.base)
     points = ShadingPoints(pixels.points, pixels.normals, pixels.wo, base[:, :3], base[:, 3], metallic)
     side = np.where(groups.of_face >= 0, groups.side, 0).astype(np.int8)
     texels = sky.columns + groups.size if sky else None

@@ -6,13 +6,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from iif_core.camera.gains import CameraGains
 from iif_core.camera.pinhole import direction_derivatives
-from iif_core.camera.pixels import DecodedView, ViewPixels, pixel_gains, pixels_of_view
+from iif_core.camera.pixels import ViewMaps, ViewPixels, pixel_gains, pixels_of_view
 from iif_core.camera.view import View
 from iif_core.light.base_scene import BaseScene, cache_origin
 from iif_core.light.emission.cache import RadianceVoxels, VoxelPixels
@@ -42,8 +42,7 @@ class ViewRecord:
     """Everything that is read of one view, decoded.
 
     Attributes:
-        pixels: the pixels that hit the mesh, n of them.
-        base: (n, 5) float32 base albedo, roughness and metallic of these pixels; empty for a held-out view.
+        pixels: the pixels that hit the mesh, with their base; without it for a held-out view.
         median_depth: metres, of the pixels with depth; None without any.
         counted: number of valid pixels of the whole photograph.
         escaping: (k,) flattened indices of the valid pixels that meet no surface.
@@ -53,7 +52,6 @@ class ViewRecord:
     """
 
     pixels: ViewPixels
-    base: np.ndarray
     median_depth: float | None
     counted: int
     escaping: np.ndarray
@@ -64,32 +62,28 @@ class ViewRecord:
 
     @classmethod
     def of(
-        cls, view: View, decoded: DecodedView, normals: np.ndarray, base: np.ndarray | None, among: np.ndarray | None = None
+        cls, maps: ViewMaps, normals: np.ndarray, base: np.ndarray | None, among: np.ndarray | None = None
     ) -> ViewRecord:
         """Collect what is read of a view.
 
         Args:
-            view: the camera.
-            decoded: photograph, G-buffer and segmentation of the view.
+            maps: of the view, with objects and interior.
             normals: (m, 3) of the faces, 0 for degenerate ones.
             base: (H * W, 5) base albedo, roughness and metallic; None for a held-out view.
             among: (H, W) bool, pixels that are looked at; None = all.
         """
         seen = None
         if among is not None:
-            shown = decoded.valid & (decoded.face >= 0) & (decoded.depth > 0) & np.isfinite(decoded.photo).all(-1)
-            seen = np.unique(decoded.face[shown])
-            among = among.ravel()
-        pixels = pixels_of_view(view, decoded, normals, among)
-        values = decoded.photo.reshape(-1, 3)
-        counted = decoded.valid.ravel() if among is None else decoded.valid.ravel() & among
+            seen = np.unique(maps.face[maps.valid & maps.hit & np.isfinite(maps.value).all(-1)])
+        pixels = pixels_of_view(maps, normals, among, base)
+        values = maps.value.reshape(-1, 3)
+        counted = (maps.valid if among is None else maps.valid & among).ravel()
         out = counted & np.isfinite(values).all(1)
         out[pixels.index] = False
-        direction = view.directions().reshape(-1, 3)[out]
-        deep = decoded.depth[decoded.depth > 0]
+        direction = maps.camera.directions().reshape(-1, 3)[out]
+        deep = maps.depth[maps.hit]
         return cls(
             pixels=pixels,
-            base=np.zeros((0, 5), np.float32) if base is None else base[pixels.index],
             median_depth=np.median(deep) if deep.size else None,
             counted=int(counted.sum()),
             escaping=np.flatnonzero(out),
@@ -98,11 +92,6 @@ class ViewRecord:
             escaping_share=np.ones(int(out.sum()), np.float32),
             seen=seen,
         )
-
-    @property
-    def megabytes(self) -> float:
-        arrays = [value for value in (*self.__dict__.values(), *self.pixels.__dict__.values()) if isinstance(value, np.ndarray)]
-        return sum(array.nbytes for array in arrays) / 1e6
 
 
 class Records(Protocol):
@@ -242,18 +231,17 @@ def seen_faces(photos: Photographs) -> np.ndarray:
 
 def choose_rows(
     photos: Photographs, groups: EmitterGroups, rest: float, thin: int = 1, tile_edge: int | None = None
-) -> tuple[ViewPixels, np.ndarray, EmissionPixels]:
+) -> tuple[ViewPixels, EmissionPixels]:
     """Draw the pixels of the linear system: a fixed number, evenly over views (one in `thin`), plus enough on every emitter.
 
     `rest` is the radiance from which surface may be an emitter; pixels of one object in a tile of `tile_edge`, None = `row_tile`,
-    will be averaged. Returns the pixels three times: as surface points, as base materials (n, 5), and as what they show.
+    will be averaged. Returns the pixels twice: as surface points, and as what they show.
     """
     elsewhere, per_view = (-(-photos.options.rows // (t * len(photos.views))) for t in (thin, 1))
     per_group = max(-(-ANCHOR_PIXELS // len(photos.views)), 4)
-    parts: list[tuple[ViewPixels, np.ndarray, EmissionPixels]] = []
+    parts: list[tuple[ViewPixels, EmissionPixels]] = []
     for view in photos.views:
-        record = photos.records[view]
-        pixels = record.pixels
+        pixels = photos.records[view].pixels
         group = groups.of_face[pixels.face]
         side = groups.side[pixels.face]
         dark_side = (group >= 0) & (side != 0) & ((side > 0) != pixels.from_front)
@@ -261,13 +249,21 @@ def choose_rows(
         rng, of_parts = (np.random.default_rng([photos.options.seed, SEEDS, 1, view.view_id, turn]) for turn in range(2))
         choice = choose_pixels(group, usable, pixels.interior, elsewhere, per_group, rng)
         part = pixels.take(choice)
-        shown, number = photos.radiance(view, part.value, part.index), np.full(len(choice), view.view_id)
+        radiance, bound = photos.radiance(view, part.value, part.index)
         covered = _coverage(photos, groups, view, part.index, group[choice], of_parts)
         tile = tile_of(part.index, view.width, tile_edge or row_tile(view.width * view.height, per_view))
-        rows = EmissionPixels(*shown, part.object_id, number, tile, group[choice], covered)
-        parts.append((part, record.base[choice], rows))
-    pixels, base, rows = (list(part) for part in zip(*parts, strict=True))
-    every, shown = joined(pixels), joined(rows)
+        rows = EmissionPixels(
+            radiance=radiance,
+            bound=bound,
+            object_id=part.object_id,
+            view=np.full(len(choice), view.view_id),
+            tile=tile,
+            group=group[choice],
+            coverage=covered,
+        )
+        parts.append((part, rows))
+    pixels, rows = (list(part) for part in zip(*parts, strict=True))
+    every, shown = ViewPixels.joined(pixels), EmissionPixels.joined(rows)
     # Border pixels mix the emitter with its surroundings; they are used only for emitters that have no other pixels.
     group = shown.group
     inner = np.bincount(group[every.interior & (group >= 0)], minlength=groups.size) > 0
@@ -276,7 +272,7 @@ def choose_rows(
     whole = (group >= 0) & ~shown.partial & ~shown.bound.any(1)
     enough = np.bincount(group[whole & use], minlength=groups.size) >= photos.options.min_observations
     use &= ~(shown.partial & np.append(enough, False)[group])
-    return every.take(use), np.concatenate(base)[use], replace(shown.take(use), rest=rest)
+    return every.take(use), replace(shown.take(use), rest=rest)
 
 
 def _coverage(
@@ -296,9 +292,3 @@ def _coverage(
     pixel, ray = np.nonzero(met >= 0)
     np.add.at(share, (own[pixel], met[pixel, ray]), np.float32(1.0 / met.shape[1]))
     return share
-
-
-def joined(parts: Sequence[Any]) -> Any:
-    """Join records of arrays, one after another."""
-    arrays = {name: value for name, value in parts[0].__dict__.items() if isinstance(value, np.ndarray)}
-    return replace(parts[0], **{name: np.concatenate([getattr(p, name) for p in parts]) for name in arrays})

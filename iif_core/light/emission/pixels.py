@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+
+from iif_core.numerics.rows import Rows
 
 TILE_PIXELS = 8
 """Pixels of one object in one tile of this edge are averaged into one row, or in a larger one of PIXELS_PER_TILE."""
@@ -18,8 +20,8 @@ ANCHOR_PIXELS = 64
 """At least this many directly seen pixels of each group enter the solve."""
 
 
-@dataclass(frozen=True)
-class EmissionPixels:
+@dataclass(frozen=True, kw_only=True)
+class EmissionPixels(Rows):
     """The pixels whose transport is traced, n of them.
 
     Attributes:
@@ -63,11 +65,6 @@ class EmissionPixels:
     def partial(self) -> np.ndarray:
         """(n,) bool: the pixel looks at a group that fills less than `FULL_COVERAGE` of it."""
         return self.own_share < FULL_COVERAGE
-
-    def take(self, keep: np.ndarray) -> EmissionPixels:
-        """Return some of the pixels."""
-        rows = {name: value[keep] for name, value in self.__dict__.items() if isinstance(value, np.ndarray)}
-        return replace(self, **rows)
 
 
 def choose_pixels(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -83,19 +82,14 @@ def _members(texel: int, height: int, width: int) -> np.ndarray:
     return (FINER * (texel // width) + row) * FINER * width + FINER * (texel % width) + column
 
 
-class _Points(NamedTuple):
-    pixels: ViewPixels
-    base: np.ndarray
-    shown: EmissionPixels
-
-
 @dataclass(frozen=True)
 class _Rows:
     """Pixels of surface that only reflects, and how the sky lights them."""
 
     photos: Photographs
     sky: Sky
-    points: _Points
+    pixels: ViewPixels
+    shown: EmissionPixels
     transport: TracedTransport
 
     @classmethod
@@ -103,19 +97,20 @@ class _Rows:
         """Trace `rows` pixels, to be averaged in tiles; the cache covers all surface."""
         none = EmitterGroups.none(len(photos.scene.faces))
         thin = -(-photos.options.rows // rows)
-        pixels, base, shown = choose_rows(photos, none, threshold, thin, tile_edge)
-        transport = trace_rows(photos, pixels, base, none, cache, sky, 4)
-        return cls(photos, sky, _Points(pixels, base, shown), transport.without_lobes())
+        pixels, shown = choose_rows(photos, none, threshold, thin, tile_edge)
+        transport = trace_rows(photos, pixels, none, cache, sky, 4)
+        return cls(photos, sky, pixels, shown, transport.without_lobes())
 
     def take(self, keep: np.ndarray) -> _Rows:
         """Some of the pixels."""
-        pixels, base, shown = self.points
-        return replace(self, points=_Points(pixels.take(keep), base[keep], shown.take(keep)), transport=self.transport.take(keep))
+        return replace(
+            self, pixels=self.pixels.take(keep), shown=self.shown.take(keep), transport=self.transport.take(keep)
+        )
 
     def held_out(self, disc: Disc) -> tuple[float, float]:
         """Misfit without a sun and with it: every second view under the light and the gains that the others have, and the other
         way round. Of a single view nothing is held out, and its misfit says that there is no sun."""
-        view, sun = self.points.shown.view, np.arange(len(disc.texels))
+        view, sun = self.shown.view, np.arange(len(disc.texels))
         first = np.isin(view, np.unique(view)[::2])
         shape = (FINER * self.sky.columns.shape[0], FINER * self.sky.columns.shape[1])
         halves = [self.take(np.flatnonzero(half)).question(disc.texels, shape) for half in (first, ~first)]
@@ -132,15 +127,15 @@ class _Rows:
         every[:, 0, :, count:] = light
         transport = TracedTransport(every, self.transport.cached)
         sky = with_columns(self.sky, len(texels))
-        problem = assemble(self.points.shown, transport, sky.size, None, sky)
+        problem = assemble(self.shown, transport, sky.size, None, sky)
         none = EmitterGroups.none(len(self.photos.scene.faces))
-        prior = light_prior(self.photos, none, self.points.shown, self.sky)[1]
+        prior = light_prior(self.photos, none, self.shown, self.sky)[1]
         solid = solid_angles(*shape).ravel()[texels]
         return SunQuestion(problem, prior, solid, self.sky.mean, base_albedo(self.photos, self.sky), self.photos.scene.n_objects)
 
     def _direct(self, texels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
         """(2, n, T, 3) what the points reflect of each texel directly, twice with one ray into each."""
-        pixels, base = self.points.pixels, self.points.base
+        pixels, base = self.pixels, self.pixels.base
         normal = pixels.normals.astype(np.float64)
         start, count = pixels.points + 1e-3 * normal, len(normal)
         albedo = base[:, :3] * (1.0 - believed_metallic(base))[:, None]

@@ -12,7 +12,7 @@ from iif_core.light.base_scene import BaseScene
 from lab.published.fitting.descent import PublishedOptions, PublishedState, fit_published
 from lab.published.fitting.sgd import SgdOptions, fit_affines_sgd
 from lab.published.state import keep_state, kept_state
-from workflow.fitting.fit_pixels import FitPixels
+from workflow.fitting.fit_pixels import PixelDraw
 from workflow.runtime.job import Job
 from workflow.scene.decoded import DecodedViews
 from workflow.stages import affines
@@ -29,14 +29,14 @@ def run(job: Job) -> None:
         affines.fit(job, lambda job, prior: partial(fit_affines_sgd, options=own), settings.solver)
 
 
-def _every(job: Job, decoded: DecodedViews, scene: BaseScene, mixed: np.ndarray) -> FitPixels:
+def _every(job: Job, decoded: DecodedViews, scene: BaseScene, mixed: np.ndarray) -> PixelDraw:
     return every_pixel(scene.n_objects, mixed)
 
 
-def every_pixel(n_objects: int, mixed: np.ndarray) -> FitPixels:
-    """Take all pixels of the objects, those along their borders too; `mixed` as in `FitPixels`."""
+def every_pixel(n_objects: int, mixed: np.ndarray) -> PixelDraw:
+    """Take all pixels of the objects, those along their borders too; `mixed` as in `PixelDraw`."""
     count = max(n_objects, 1)
-    return FitPixels(mixed, np.ones(count, bool), np.ones(count), 0)
+    return PixelDraw(mixed, np.ones(count, bool), np.ones(count), 0)
 
 
 def _published(job: Job, problem: FitProblem, start: Response) -> FitResult:

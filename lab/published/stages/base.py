@@ -24,10 +24,12 @@ from lab.published.state import keep_state, kept_state
 from workflow.artifacts.scratch import Scratch
 from workflow.artifacts.store import split_rgb
 from workflow.runtime.job import Job
+from workflow.scene.base_files import write_base
+from workflow.scene.fusion_input import read_inputs
 from workflow.scene.normal_form import View
 from workflow.scene.predictions import Predictions, StoredPredictions
 from workflow.settings.options import options_of
-from workflow.stages.base import MEMORY_BYTES, read_inputs, write
+from workflow.stages.base import MEMORY_BYTES
 
 KEPT_EVERY = 30.0
 """Seconds between two states of a descent that are written; each has 335 MB with the paper's hash grid."""
@@ -48,7 +50,7 @@ def fuse(job: Job, prior: Predictions) -> None:
     with job.timed("solve"):
         result, fit = _solve(job, found.problem)
     seen = {view.view_id for view in found.views}
-    write(
+    write_base(
         job,
         found,
         result,
