@@ -274,7 +274,6 @@ def test_dark_and_blinding_rooms_run_to_the_end(tmp_path, llvm, caplog, dynamic_
 
 def test_known_scale_of_a_lamp_and_of_a_patch(hdr):
     """One factor, stated: the light is multiplied by it and the albedos divided; what is unknown is refused before any work."""
-
     folder, room = hdr
     free = opened(folder, "affines").table("objects.parquet")
     table, radiance = _emitters(folder)
