@@ -405,21 +405,21 @@ def result_of(
     models = describe_models(rank, free, affine, counts, given)
     hold_given(affine, free, np.zeros((n_objects, 2)), given)
     return FitResult(
-        affine,
-        covariance,
-        free,
-        counts.astype(np.int64),
-        residual,
-        models,
-        final.response,
-        1.0,
-        list(state.history) or [0.0],
-        state.converged or not free.any(),
-        of_response,
-        max(len(state.history) - 1, 0),
-        state.reason or "nothing to fit",
-        facts,
-        light_gain,
+        affine=affine,
+        covariance=covariance,
+        free=free,
+        pixels=counts.astype(np.int64),
+        residual=residual,
+        model=models,
+        response=final.response,
+        light_scale=1.0,
+        history=list(state.history) or [0.0],
+        converged=state.converged or not free.any(),
+        response_covariance=of_response,
+        iterations=max(len(state.history) - 1, 0),
+        reason=state.reason or "nothing to fit",
+        facts=facts,
+        light_gain=light_gain,
     )
 
 

@@ -23,7 +23,7 @@ _CLUSTERS_AT_ONCE = 1000
 _OF_EACH_PIXEL = ("index", "obj", "base", "diffuse", "lobes", "target", "exposure", "saturated", "trust")
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Pixels:
     """Usable pixels, sorted by (object, cluster); n pixels, C clusters.
 
@@ -199,19 +199,19 @@ def prepare_pixels(
             kernels.slopes(own, levels, lobes[:, :, 1, half, at])
     lobes = lobes.reshape(*lobes.shape[:3], 6 * len(problem.diffuse))
     pixels = Pixels(
-        index,
-        obj,
-        np.ascontiguousarray(problem.base[index], kind),
-        diffuse,
-        lobes,
-        levels,
-        np.ascontiguousarray(tone.value(problem.value[index]), kind),
-        np.ascontiguousarray(problem.exposure[index], np.float64),
-        np.ascontiguousarray(problem.saturated[index]),
-        np.ones((len(index), 3), kind),
-        starts,
-        first,
-        usable,
+        index=index,
+        obj=obj,
+        base=np.ascontiguousarray(problem.base[index], kind),
+        diffuse=diffuse,
+        lobes=lobes,
+        levels=levels,
+        target=np.ascontiguousarray(tone.value(problem.value[index]), kind),
+        exposure=np.ascontiguousarray(problem.exposure[index], np.float64),
+        saturated=np.ascontiguousarray(problem.saturated[index]),
+        trust=np.ones((len(index), 3), kind),
+        starts=starts,
+        first=first,
+        usable=usable,
     )
     return pixels, tone
 

@@ -127,7 +127,7 @@ class FitOptions:
     threads: int = 1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FitResult:
     """Result of a solver.
 

@@ -93,7 +93,7 @@ class Dropped:
     reason: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FusionResult:
     """The base texture, the maps and selection that it belongs to, and what is known about its error.
 
