@@ -89,9 +89,9 @@ def _denoised(values: np.ndarray, index: np.ndarray, view: View) -> np.ndarray:
     """Denoise values (n, 3) of the pixels `index` as a picture; the rest of it is black."""
     image = np.zeros((view.height * view.width, 3), np.float32)
     image[index] = values
-    return _denoised(image.reshape(view.height, view.width, 3)).reshape(-1, 3)[index]
+    return denoise_alone(image.reshape(view.height, view.width, 3)).reshape(-1, 3)[index]
 
 
-def _denoised(radiance: np.ndarray) -> np.ndarray:
+def denoise_alone(radiance: np.ndarray) -> np.ndarray:
     """Denoise a linear HDR picture (H, W, 3) without guides."""
     return np.maximum(_oidn().denoise(np.ascontiguousarray(radiance, np.float32), hdr=True), 0)
