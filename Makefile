@@ -24,7 +24,7 @@ help:
 	@echo 'make score/<name>     scores of the maps in MAPS=<folder> against a scene with truth'
 	@echo 'make scenes           every scene of the batch table'
 	@echo '                      QUALITY=standard  CORES=2  SNAKEMAKE_ARGS="--dry-run"'
-	@echo 'make status           where every scene stands, also while a run goes on'
+	@echo 'make status           where every scene stands, also during a run'
 	@echo 'make verify           re-hash every artefact against its manifest'
 	@echo 'make test             all tests but the long ones (PYTEST_ARGS="-k laplace" for a part)'
 	@echo 'make test-all         every test, also those on large scenes'
@@ -153,7 +153,7 @@ licences:
 sbom:
 	uv run --quiet envs/third_party.py --sbom sbom.json
 
-# The site has an environment of its own: none of its packages is needed to run the workflow.
+# The site has a separate environment: none of its packages is needed to run the workflow.
 docs: .venv-docs/.made
 	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --strict
 

@@ -53,7 +53,7 @@ if [ -f /etc/ssl/certs/ca-certificates.crt ]; then mounts+=(--volume /etc/ssl/ce
     awk '{key = $2; sub(/^[^ ]+ /, ""); if (key == "default-timeout") {sub(/^default-/, "")} line[key] = $0} END {for (key in line) print line[key]}'; } >"$work/pip.conf"
 buildah copy --quiet "$container" "$work/pip.conf" /etc/pip.conf >/dev/null
 for folder in $(grep -oE '(file://|= ?| )/[^ ]+' "$work/pip.conf" | sed -E 's,^(file://|= ?| ),,' | sort -u); do
-    # A package index on disk keeps its files beside its folder simple/.
+    # A package index on disk keeps its files next to its folder simple/.
     case $folder in */simple) folder=${folder%/simple} ;; esac
     if [ -d "$folder" ]; then mounts+=(--volume "$folder:$folder:ro"); fi
 done
@@ -61,6 +61,6 @@ buildah commit --quiet "$container" "$base" >/dev/null
 buildah rm "$container" >/dev/null
 
 say "building the steps of envs/Dockerfile in a chroot, and trying the image as its last step ..."
-{ cat envs/Dockerfile; echo "RUN $tried"; } >"$work/Dockerfile" # a container of its own would be one more copy of all
+{ cat envs/Dockerfile; echo "RUN $tried"; } >"$work/Dockerfile" # another container would be one more copy of all
 buildah bud --isolation chroot --pull-never "${mounts[@]}" --ignorefile envs/Dockerfile.dockerignore --file "$work/Dockerfile" --tag $name .
 say "ok: the steps of envs/Dockerfile on packages of Debian $suite in the place of $base, and tried"

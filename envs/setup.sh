@@ -51,7 +51,7 @@ if [ -n "${PYTHON:-}" ] && [ "$("$PYTHON" -c "$version" 2>&1)" != "$("$venv/bin/
 installed=no
 if [ "$lock_found $torch_found $folder" = "$lock_wanted $torch_wanted $root" ]; then installed=yes; fi
 
-# Every Python of the environment finds its LLVM: also the command mitsuba, and render.py beside an exported scene.
+# Every Python of the environment finds its LLVM: also the command mitsuba, and render.py next to an exported scene.
 name_llvm() {
     local packages
     for packages in "$venv"/lib/python3*/site-packages; do

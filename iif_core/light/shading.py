@@ -120,7 +120,7 @@ def light_of_pixels(
 ) -> PixelLight:
     """Compute the light at the pixels of a view.
 
-    Diffuse light is that of the cells, averaged with what the pixels' own paths find (Eq. S.19).
+    Diffuse light is the light of the cells, averaged with what the pixels' own paths find (Eq. S.19).
 
     Args:
         world: None = the scene has no specular lobes: those of uniform light take their place (Eq. S.22), and nothing is traced.

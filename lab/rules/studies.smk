@@ -33,7 +33,7 @@ rule study:
 
 # Shows the variants that are finished and computes nothing else, so a parameter changes with them.
 rule study_grid:
-    """Draw a sheet of pictures of a study, for a paper: methods beside each other, as PNG and PDF."""
+    """Draw a sheet of pictures of a study, for a paper: methods next to each other, as PNG and PDF."""
     output:
         picture="results/studies/{study}.grid.png",
         document="results/studies/{study}.grid.pdf",

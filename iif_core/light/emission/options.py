@@ -1,4 +1,4 @@
-"""What the search for the light of a scene can be told, and where it says what it does."""
+"""Options of the search for the light of a scene, and its log."""
 
 from __future__ import annotations
 
