@@ -53,7 +53,7 @@ def _of_many(annotation: Any) -> str:
 FIRST = "What you set"
 PARTS = {
     "Relighting": (
-        "Other light, edits and cameras; usually in a plan of its own (docs/guide/relighting.md).",
+        "Other light, edits and cameras; usually in a separate plan (docs/guide/relighting.md).",
         ("relight_title", "relight"),
     ),
     "Advanced": (

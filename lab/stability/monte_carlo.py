@@ -179,7 +179,7 @@ def extremes(size: int = 32) -> dict[str, Room]:
     eye = _rays((2, 0.2, 1.3), (2, 2.2, 0.9), size)
     return {
         "lamp of 4 cm2 and 1e6": Room([shell, lamp], (0, 0, 0), *eye),
-        "the same next to a mirror, r = 0.02": Room([shell, lamp, mirror], (0, 0, 0), *eye),
+        "the same beside a mirror, r = 0.02": Room([shell, lamp, mirror], (0, 0, 0), *eye),
     }
 
 

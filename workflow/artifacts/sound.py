@@ -94,7 +94,7 @@ def _manifest(path: Path, noted: Stamps, schema: str) -> tuple[dict[str, Any], s
 
 
 def of_another(document: dict[str, Any], owner: dict[str, str]) -> str:
-    """Return whose manifest it is, if it is not the manifest of `owner` (scene and, for a stage, stage); otherwise an empty text."""
+    """Return whose manifest it is, if it is not the manifest of `owner` (scene and, for a stage, stage); else an empty text."""
     found = {key: document.get(key) for key in owner}
     if found == owner:
         return ""
