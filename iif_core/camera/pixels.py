@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import DTypeLike
-from scipy.ndimage import minimum_filter
 
 from iif_core.camera.gains import CameraGains, radius_squared
 from iif_core.camera.pinhole import direction_derivatives
@@ -133,6 +132,8 @@ def pixel_steps(view: View, face: np.ndarray, holes: bool) -> tuple[np.ndarray, 
     Returns:
         Change of direction to the next pixel on the right and below, (3,) each; (H * W, 3) each with `holes`.
     """
+    from scipy.ndimage import minimum_filter
+
     steps = direction_derivatives(view.fx, view.fy, view.world_from_camera)
     if not holes:
         return steps

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from iif_core.fitting.pixels import fair_shares
+from iif_core.fitting.shares import fair_shares
 from iif_core.fusion import problem
 from iif_core.reflectance import material
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from iif_core.numerics.color import linear_from_srgb
-from iif_core.numerics.filters import fill_from_neighbours
+from iif_core.numerics.filling import fill_from_neighbours
 from tests.errors import refused
 from workflow.artifacts.files import write_exr
 from workflow.priors import files, retinex

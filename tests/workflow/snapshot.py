@@ -16,6 +16,7 @@ DECIBELS = 0.3
 """How far a score may move: PSNR directly, errors as 10 log10 of their ratio. Machines differ by less."""
 FLOOR = 1e-4
 """Errors below it count as this much, so that two results without an error agree."""
+LARGER_IS_BETTER = ("psnr", "iou")
 GATED = (
     ("albedo", "psnr", "raw"),
     ("albedo", "psnr", "scaled"),
@@ -58,6 +59,12 @@ def moved(name: str, found: float, expected: float) -> float:
     if name.split("/")[1] == "psnr":
         return abs(found - expected)
     return abs(10 * math.log10(max(found, FLOOR) / max(expected, FLOOR)))
+
+
+def worsened(name: str, found: float, expected: float) -> float:
+    """By how many decibels a score has become worse; 0 if it has become better."""
+    larger_is_better = name.split("/")[1] in LARGER_IS_BETTER
+    return moved(name, found, expected) if (found < expected) == larger_is_better else 0.0
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from iif_core.camera.pixels import ViewPixels
-from iif_core.fitting.pixels import fair_shares
+from iif_core.fitting.shares import fair_shares
 from workflow.scene.normal_form import View
 
 THIN_PIXELS = 50

@@ -8,7 +8,7 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.fusion.problem import prediction_faults
-from iif_core.numerics.filters import fill_from_neighbours
+from iif_core.numerics.filling import fill_from_neighbours
 from iif_core.reflectance.material import PROPERTIES
 from workflow.artifacts.store import split_rgb
 from workflow.priors import Predicted

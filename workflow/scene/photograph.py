@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from iif_core.numerics.color import key_exposure, srgb_from_linear
-from iif_core.numerics.filters import fill_from_neighbours
+from iif_core.numerics.filling import fill_from_neighbours
 from workflow.scene.normal_form import CaptureReader, View
 
 GAMMA = 2.2
