@@ -294,7 +294,10 @@ def check_keys(room):
     first = room.evaluate("room.camera()")
 
     def held(key):
+        """Hold a key until it shows, which takes longer than a quarter of a second where a busy machine draws the room."""
+        before = room.evaluate("JSON.stringify(room.camera())")
         room.keyboard.down(key)
+        room.wait_for_function("before => JSON.stringify(room.camera()) !== before", arg=before)
         room.wait_for_timeout(250)
         room.keyboard.up(key)
         return room.evaluate("room.camera()")
