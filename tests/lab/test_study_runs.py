@@ -37,6 +37,9 @@ show: [albedo/psnr, albedo/lpips, albedo/lpips_vgg, roughness/l2]
 """
 
 
+pytestmark = pytest.mark.long
+
+
 class Study:
     """A folder with a study in it, and Snakemake run there."""
 
@@ -169,7 +172,6 @@ def test_variants_of_other_photographs_are_planned_with_what_they_share(study):
     assert rules >= {"capture", "affines", "metrics", "common_scores", "study"}
 
 
-@pytest.mark.long
 def test_variants_of_other_photographs_are_scored_at_the_views_that_they_share(study):
     study.write("lab/config/studies/sizes.yaml", SHARED)
     result = study.run("results/studies/sizes.parquet")

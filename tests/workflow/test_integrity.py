@@ -7,6 +7,7 @@ import signal
 import subprocess
 import time
 
+import pytest
 from support import error_of, manifests, planned
 
 from tests.errors import named
@@ -132,6 +133,7 @@ def test_the_last_line_is_the_reason_of_the_failed_job(workflow):
     assert "long ago" not in failed.stderr
 
 
+@pytest.mark.long
 def test_killed_run_resumes_to_the_same_result(finished, tmp_path):
     """kill -9 on a running job, then on a job and Snakemake itself: the same command completes, every manifest equals the
     undisturbed run's. A Snakemake that could not clean up leaves its lock; it says so, and that --unlock removes it."""

@@ -28,6 +28,7 @@ def test_nine_scenes_lack_nothing_but_their_data(workflow, table):
         assert f"line {line.number}: {line.path}: " in said, said
 
 
+@pytest.mark.long
 def test_first_contact_with_scannetpp(workflow, table):
     """Masks, bad and test photographs, a scene without its mesh, one without a mask: what can be made is, the rest is named."""
     room = mini.room()
