@@ -618,11 +618,30 @@ def _(root):
     return noted(root, "masked")
 
 
+def listed(root, *other):
+    """The last of three photographs is for testing; `other`: those that are other pictures than that one."""
+    document = own.bare(root / "data/own")
+    for number in other:
+        own.save_png(root / f"data/own/images/00{number}.png", np.full((48, 64, 3), 0.4 + 0.02 * number))
+    own.write_transforms(root / "data/own", document | {"test_filenames": ["images/002.png"]})
+
+
 @case("lists of train and test")
 def _(root):
-    document = own.bare(root / "data/own")
-    own.write_transforms(root / "data/own", document | {"test_filenames": ["images/002.png"]})
+    listed(root, 0, 1)
     return noted(root, "lists")
+
+
+@case("a used photograph that repeats a held-out one")
+def _(root):
+    listed(root, 1)
+    return noted(root, "repeat")
+
+
+@case("all used photographs repeat a held-out one")
+def _(root):
+    listed(root)
+    return captured(root)
 
 
 case("grey image")(lambda root: first_as(root, Image.new("L", (64, 48), 90), "grey"))

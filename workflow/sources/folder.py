@@ -186,9 +186,10 @@ def _held_out(task: _Task, poses: Sequence[np.ndarray]) -> held_out.HeldOut:
             depths[i] = np.median(depth[face >= 0]) if (face >= 0).any() else np.nan
     found = held_out.hold_out(split, digests, poses, focal, depths)
     if "train" not in found.split:
+        fewer = "hold out fewer in its lists" if task.listed else "set `capture.test_every: 0`"
         raise InputError(
             f"{task.inputs.transforms.path}: every photograph that is not held out repeats a held-out one (the same file, or the"
-            " same place to a pixel), so none is left to use: remove repeated photographs, or set `capture.test_every: 0`"
+            f" same place to a pixel), so none is left to use: remove repeated photographs, or {fewer}"
         )
     return found
 
