@@ -69,4 +69,5 @@ def worsened(name: str, found: float, expected: float) -> float:
 
 if __name__ == "__main__":
     document = {scene: take(Path(folder), scene) for scene, folder in zip(("tiny", "kitchen"), sys.argv[1:], strict=True)}
+    document["kitchen"] = {"scores": document["kitchen"]["scores"]}  # its counts differ from machine to machine
     PATH.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n")
