@@ -36,7 +36,7 @@ def run(job: Job) -> None:
     with job.timed("stability"):
         stability = measure_stability(kind, surface, job.settings, objects, job.progress)
 
-    maps = [objects.map_of(capture.gbuffer(view)[1]) for view in capture]
+    maps = [objects.map_of(surface.decoded.gbuffer(view)[1]) for view in capture]
     segment_maps, segments = segment_table(maps)
     border = options_of(BorderOptions, own).border_erosion
     for done, (view, object_map, segment_map) in enumerate(zip(capture, maps, segment_maps, strict=True), 1):
