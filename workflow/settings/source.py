@@ -37,8 +37,10 @@ class PhotographedSource(Section):
     def _names_a_turn(cls, value: str) -> str:
         try:
             turn_of(mesh_axes(value))
-        except InputError as error:
-            raise ValueError(f"{error}, or one of {', '.join(MESH_UP)}") from None
+        except InputError:
+            words = ", ".join(map(repr, MESH_UP))
+            turn = "x, y and z in another order or with signs that make no mirror image: x -z y"
+            raise ValueError(f"Needed: {words}, or {turn}") from None
         return value
 
 
