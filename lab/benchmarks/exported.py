@@ -265,11 +265,11 @@ def measure(asked: argparse.Namespace, place: Path, measured: Callable[[str, arg
 
 def write_page() -> None:
     """Make all tables of the page anew, those of `room_light.py` too."""
-    from lab.benchmarks import room_light
+    from lab.benchmarks import room_light_tables
     from workflow.report.blocks import fill
 
-    rows, lit = (json.loads(path.read_text()) if path.is_file() else [] for path in (ROWS, room_light.ROWS))
-    PAGE.write_text(fill(PAGE.read_text(), tables(rows) | room_light.tables(lit)))
+    rows, lit = (json.loads(path.read_text()) if path.is_file() else [] for path in (ROWS, room_light_tables.ROWS))
+    PAGE.write_text(fill(PAGE.read_text(), tables(rows) | room_light_tables.tables(lit)))
 
 
 def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:

@@ -23,7 +23,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
 
-ROWS = Path("lab/notebook/data/room_light.json")
+from lab.benchmarks.exported import measure
+from lab.benchmarks.room_light_tables import ROWS
+
 STEP = 24
 """Pixels of the canvas between two that are looked at."""
 BRIGHT = 0.9
@@ -235,37 +237,6 @@ def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:
     return row
 
 
-def _ms(value: float | None) -> str:
-    return "" if value is None else f"{value:.0f}"
-
-
-def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
-    """The tables of the page."""
-    from workflow.report.blocks import markdown
-
-    pages = [
-        [row["scene"], f"{row['mb']:.1f}", f"{row['opened_s']:.1f}", _ms(row.get("slide_ms")), _ms(row["full_ms"])]
-        for row in rows
-    ]
-    lamps, texels = [], []
-    for row in rows:
-        for lamp in row["lamps"]:
-            ratios = (f"{lamp[name]:.3f}" for name in ("pixels", "maps", "maps_of_all"))
-            lamps.append([row["scene"], lamp["lamp"], *ratios, f"{100 * lamp['clipped']:.1f} %", f"{100 * lamp['median']:.1f} %"])
-            errors = (f"{lamp['texels'][name]:.3f}" for name in ("ratio", "rms", "rare"))
-            texels.append([row["scene"], lamp["lamp"], *errors])
-    heads = {
-        "room": ["scene", "room.html, MB", "opens, s", "slider, ms", "all pixels, ms"],
-        "room_lamps": ["scene", "lamp", "pixels", "maps", "maps, clipped too", "clipped", "median difference"],
-        "room_texels": ["scene", "lamp", "ratio of the means", "relative RMS error", "99.9th percentile"],
-    }
-    return {
-        "room": "\n".join(markdown(heads["room"], pages, 1)),
-        "room_lamps": "\n".join(markdown(heads["room_lamps"], lamps, 2)),
-        "room_texels": "\n".join(markdown(heads["room_texels"], texels, 2)),
-    }
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*")
@@ -274,8 +245,6 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=256)
     parser.add_argument("--texels", type=int, default=2000)
     parser.add_argument("--texel-samples", type=int, default=2048)
-    from lab.benchmarks.exported import measure
-
     measure(parser.parse_args(), ROWS, measured)
 
 
