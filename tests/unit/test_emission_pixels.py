@@ -10,6 +10,15 @@ from iif_core.light.emission.problem import ANCHOR_WEIGHT, assemble
 from iif_core.light.emission.rows import TracedTransport
 
 
+def of_one_object(radiance, group, coverage):
+    """Pixels of one view and one object, each in another tile; what shares a pixel with an emitter has radiance 5."""
+    n = len(radiance)
+    nothing = np.zeros(n, int)
+    bound = np.zeros((n, 3), bool)
+    seen = {"group": group, "coverage": coverage, "rest": 5.0}
+    return EmissionPixels(radiance=radiance, bound=bound, object_id=nothing, view=nothing, tile=np.arange(n), **seen)
+
+
 def test_pixels_are_drawn_evenly_and_border_pixels_only_where_there_are_no_others():
     group = np.repeat([-1, 0, 1], [100, 20, 20])
     interior = np.arange(140) % 2 == 0
@@ -47,16 +56,7 @@ def test_a_pane_behind_blinds_is_as_bright_as_its_light_and_not_as_its_pixels():
     y = truth * a[:, 0] * np.exp(0.1 * rng.standard_normal((n, 1)))
     y[:seen] = (share * truth + (1 - share) * 2.0)[:seen, None]
     coverage = np.where(group >= 0, share, 0.0)[:, None].astype(np.float32)
-    pixels = EmissionPixels(
-        radiance=y,
-        bound=np.zeros((n, 3), bool),
-        object_id=np.zeros(n, int),
-        view=np.zeros(n, int),
-        tile=np.arange(n),
-        group=group,
-        coverage=coverage,
-        rest=5.0,
-    )
+    pixels = of_one_object(y, group, coverage)
     transport = TracedTransport(np.broadcast_to(a.astype(np.float32), (2, 1, n, 1, 3)), np.zeros((2, 1, n, 3)))
     prior = EmissionPrior.independent(np.full((1, 3), 12.0))
     bounded = prior.solve(assemble(pixels, transport, 1).rows).radiance
@@ -77,16 +77,7 @@ def test_both_ends_of_a_pane_outweigh_the_rows_of_its_own_group():
     y[:seen] = 6.0
     coverage = np.zeros((n, n_groups), np.float32)
     coverage[:seen, 2] = 0.4
-    pixels = EmissionPixels(
-        radiance=y,
-        bound=np.zeros((n, 3), bool),
-        object_id=np.zeros(n, int),
-        view=np.zeros(n, int),
-        tile=np.arange(n),
-        group=group,
-        coverage=coverage,
-        rest=5.0,
-    )
+    pixels = of_one_object(y, group, coverage)
     transport = TracedTransport(np.broadcast_to(light.astype(np.float32), (2, 1, n, n_groups, 3)), np.zeros((2, 1, n, 3)))
     found = assemble(pixels, transport, n_groups)
     weight, matrix = found.rows.weight[found.anchor], found.rows.matrix[0, 0][found.anchor]

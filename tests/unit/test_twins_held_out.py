@@ -46,8 +46,8 @@ def test_a_picture_from_the_same_place_to_a_pixel_is_a_twin(other, repeats):
     assert (found.split[1] == "test") is repeats and (1 in found.twins) is repeats
 
 
-def test_the_bound_is_one_of_pixels():
-    """Surface in front of the camera, at the median depth, really moves by less than the bound says."""
+def test_what_moves_by_more_than_a_pixel_is_no_twin():
+    """Surface in the middle of the picture, at the median depth, projected into both cameras."""
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-0.05, 0.05, (200, 2)), np.full((200, 1), 2.0)], 1)
     for _ in range(50):

@@ -56,8 +56,8 @@ def hold_out(
 ) -> HeldOut:
     """Hold out every photograph that repeats a held-out one: the same file, or a picture from the same place.
 
-    From camera h to camera u surface at depth z moves by about f (|c_u - c_h| / z + angle(R_h, R_u)) pixels, which is an upper
-    bound for turns about any axis but the optical one. Twins of twins stay in use, so that a video does not vanish as a whole.
+    In the middle of the picture, surface at depth z moves by at most about f (|c_u - c_h| / z + angle(R_h, R_u)) pixels from
+    camera h to camera u. Twins of twins stay in use, so that a video does not vanish as a whole.
 
     Args:
         split: `train` or `test` for each of n photographs.
