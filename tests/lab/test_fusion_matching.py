@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from iif_core.errors import InputError
 from iif_core.fusion.direct import solve_direct
 from iif_core.fusion.options import FusionOptions
 from lab.published.fusion.direct import describe_fit, solve_distribution
@@ -14,6 +13,7 @@ from lab.published.fusion.matching import identity_penalty, penalised_affine, pe
 from lab.published.fusion.reference_loss import loss_of_result
 from lab.published.fusion.sgd.options import sgd_options
 from lab.published.fusion.sgd.solve import converged, solve_sgd
+from tests.errors import refused
 from tests.unit.test_fusion_direct import simulated
 
 
@@ -123,7 +123,7 @@ def test_polish_counts_only_usable_predictions():
 
 def test_a_selection_that_does_not_fit_is_refused():
     problem, _ = simulated()
-    with pytest.raises(InputError, match="chosen predictions"):
+    with refused("(2, 3)"):
         solve_distribution(problem, chosen=np.zeros((2, 3), int))
 
 

@@ -5,9 +5,9 @@ from dataclasses import fields
 import pytest
 from pydantic import ValidationError
 
-from iif_core.errors import InputError
 from lab.published.fitting.sgd import SgdOptions
 from lab.published.fusion.direct import POLISH
+from tests.errors import refused
 from workflow import settings
 from workflow.costs.model import predict
 from workflow.costs.work import SceneSize, work_of
@@ -121,5 +121,5 @@ def test_a_preset_lies_between_the_scene_and_the_variant(study):
 
 
 def test_a_preset_that_is_not_there_is_refused_with_those_that_are(study):
-    with pytest.raises(InputError, match=r"lab/config/studies/presets/publshed.yaml.*published, published_repaired"):
+    with refused("lab/config/studies/presets/publshed.yaml", "published", "published_repaired"):
         settings.load("t--a-theirs-s0", "draft", study("{preset: publshed}"))

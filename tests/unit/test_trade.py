@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
+from tests.errors import refused
 from workflow.costs.model import Range
 from workflow.runtime import fingerprint as fp
 from workflow.runtime import forecast
@@ -55,9 +56,9 @@ def test_a_budget_gets_the_best_point_that_keeps_to_it(table, budget, point):
 
 
 def test_a_budget_below_the_cheapest_point_is_refused_with_the_least_and_what_holds_it_up(table):
-    with pytest.raises(InputError, match=r"take longer on this machine, at the least: quality p01, about 30 s \(24 s to 39 s\)"):
+    with refused("p01", "30 s", "24 s", "39 s"):
         chosen("29s")
-    with pytest.raises(InputError, match=r"config/scenes/fixed.yaml sets capture.views itself"):
+    with refused("config/scenes/fixed.yaml", "capture.views"):
         chosen("29s", "fixed")
     assert "sets capture.views itself" in chosen("70s", "fixed").line
     assert "quality p02 (draft), about 60 s (48 s to 1 min 18 s)" in chosen("70s").line
@@ -77,34 +78,33 @@ def test_a_target_follows_what_was_measured_in_the_room(table, tmp_path, monkeyp
     assert chosen("albedo:19.5").quality == "p03" and chosen("albedo:19.5", "other").quality == "p01"
     assert "from bench/room/bench.json" in chosen("albedo:19.5").line
     assert chosen("albedo:19").quality == "draft"  # 3 dB worse in the mean
-    with pytest.raises(InputError, match=r"p04, is expected to reach albedo 22.0 dB in room \(from bench/room"):
+    with refused("p04", "albedo", "22.0 dB", "bench/room"):
         chosen("albedo:22.1")
-    with pytest.raises(InputError, match="no such score: no photograph was held out"):
+    with refused("held_out"):
         chosen("held_out:20")
-    with pytest.raises(InputError, match="bare holds no photograph out; set"):
+    with refused("held_out", "bare"):
         chosen("held_out:20", "bare")
     (tmp_path / "bench/room/bench.json").write_text("{")
-    with pytest.raises(InputError, match="damaged; make it again: snakemake --cores 2 bench/room --force"):
+    with refused("bench/room/bench.json", "snakemake --cores 2 bench/room --force"):
         chosen("albedo:19.5")
 
 
 @pytest.mark.parametrize(
     ("config", "words"),
     [
-        ({"qualty": "draft"}, ["qualty: unknown key. Did you mean quality?", "Allowed: quality, maps, colour"]),
-        ({"budget": 120}, ["there is no `budget` any more; write --config quality=120s"]),
-        ({"quality": "draft", "target": "held_out:24"}, ["no `target` any more; write --config quality=held_out:24"]),
-        ({"point": "p05"}, ["no `point` any more; write --config quality=p05"]),
-        ({"events": "x"}, ["no `events` any more", "python -m workflow status --json"]),
-        *(({"quality": value}, [f"quality={value}: unknown quality"]) for value in ("soon", "0s", "-3s", "nans", "120", "p99")),
-        *(({"quality": value}, ["such as albedo:24"]) for value in ("beauty:3", "albedo", "albedo:inf", "albedo:0", "albedo:-1")),
-        ({"quality": "drafty"}, ["unknown quality. Did you mean draft?"]),
+        ({"qualty": "draft"}, ["qualty", "quality", "maps", "colour"]),
+        ({"budget": 120}, ["budget", "--config quality=120s"]),
+        ({"quality": "draft", "target": "held_out:24"}, ["target", "--config quality=held_out:24"]),
+        ({"point": "p05"}, ["point", "--config quality=p05"]),
+        ({"events": "x"}, ["events", "python -m workflow status --json"]),
+        *(({"quality": value}, [f"quality={value}"]) for value in ("soon", "0s", "-3s", "nans", "120", "p99")),
+        *(({"quality": value}, ["albedo:24"]) for value in ("beauty:3", "albedo", "albedo:inf", "albedo:0", "albedo:-1")),
+        ({"quality": "drafty"}, ["drafty", "draft"]),
     ],
 )
 def test_what_cannot_be_asked_for_is_one_clear_error(config, words):
-    with pytest.raises(InputError) as error:
+    with refused(*words):
         choose.read(config, 2)
-    assert all(word in str(error.value) for word in words), error.value
 
 
 def test_a_choice_is_kept_while_nothing_but_the_machine_changes(table, monkeypatch, tmp_path):
@@ -129,7 +129,7 @@ def test_points_that_do_not_go_with_a_scene_are_left_out(table, monkeypatch):
     monkeypatch.setattr(choose.forecast, "wall", wall)
     assert chosen("60s").quality == "p04"
     monkeypatch.setattr(choose, "points", lambda: {"p01": table["p01"]})
-    with pytest.raises(InputError, match="p01 contradicts the scene"):
+    with refused("p01"):
         chosen("60s")
 
 
@@ -216,5 +216,5 @@ def test_a_kind_of_work_that_was_never_measured_has_no_promised_time(monkeypatch
     document = json.loads(fp.resolved("kitchen", "draft"))
     document["prior"]["kind"] = "rgbx"
     monkeypatch.setattr(fp, "resolved", lambda scene, quality: json.dumps(document))
-    with pytest.raises(InputError, match="stage prior takes with 'rgbx' was never measured"):
+    with refused("prior", "rgbx"):
         forecast.wall("kitchen", "draft", 2)
