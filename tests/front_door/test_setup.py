@@ -201,6 +201,7 @@ def test_a_torch_that_pip_does_not_foresee_needs_a_hash_too(copy, index):
     assert not installed_torch(copy)
 
 
+@pytest.mark.long
 def test_the_cuda_builds_need_more_and_all_of_it_by_hash(copy, index, tmp_path):
     environment = index("", listed=True, extra="torch-cuda.lock\t1\t2000\t4000\n")
     _, right = wheel(tmp_path / "wheels", "iif_cuda", "1")
@@ -222,6 +223,7 @@ def test_a_build_that_is_not_listed_is_refused_unless_it_is_chosen(copy, index):
     assert installed_torch(copy) == ["torch-2.13.0+cu126.dist-info"]
 
 
+@pytest.mark.long
 def test_no_network(copy, stand_in, clean_environment):
     """Port 9 of this machine refuses connections. Afterwards .venv counts as incomplete."""
     stand_in("df", "echo header; echo /dev/x 99999999 0 8388608 9% /\n")  # the disk under the test may be smaller

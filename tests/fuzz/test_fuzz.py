@@ -106,6 +106,7 @@ HARM = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("harm", HARM)
 def test_a_reader_that_does_harm_is_found(monkeypatch, harm):
     if harm == "sleep":
@@ -118,6 +119,7 @@ def test_a_reader_that_does_harm_is_found(monkeypatch, harm):
     assert [result.verdict for result in results] == [verdict] * 2, results
 
 
+@pytest.mark.long
 def test_a_loop_is_found_by_its_time(monkeypatch):
     monkeypatch.setattr(runner, "CPU_SECONDS", 1)
 

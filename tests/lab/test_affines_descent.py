@@ -20,6 +20,7 @@ def ldr():
     return problem_of(rng, 4, 500, value_of=lambda x: np.minimum(response("gamma", [1.9])(x), 1), noise=0.1, halves=2)[0]
 
 
+@pytest.mark.long
 def test_reference_loss_by_hand(ldr):
     """Eq. M.45, written with plain arrays."""
     from iif_core.fitting.levels import interpolate_levels

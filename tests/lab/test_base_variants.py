@@ -57,6 +57,7 @@ def base_of(folder, name):
     return StageReader(folder / "results/tiny/base", "base", "tiny")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", VARIANTS)
 def test_variant(folder, name):
     reader = base_of(folder, name)
@@ -101,6 +102,7 @@ def test_combinations_that_mean_nothing_are_refused(folder):
     path.write_text(text + "\n")
 
 
+@pytest.mark.long
 def test_one_correction_an_image_underfits():
     """Objects err differently, so one affine map per image cannot correct them (the paper's ablation)."""
     problem, truth = simulated()

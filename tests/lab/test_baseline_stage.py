@@ -47,6 +47,7 @@ def ldr(tmp_path_factory, llvm):
     return folder, room, (ours.manifest["files"], set(ours.json("affines.json")))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", MODELS)
 def test_every_model_leaves_what_ours_leaves(ldr, model):
     folder, _, (files, keys) = ldr
@@ -110,6 +111,7 @@ def test_texture_average_is_the_mean_of_the_photographs(ldr):
     assert seen.mean() > 0.8 and (cells["metallic"] == 0).all() and np.ptp(cells["roughness"]) == 0
 
 
+@pytest.mark.long
 def test_free_cells_see_what_the_prior_does_not(tmp_path, llvm):
     """Linear photographs: the albedo of walls comes from them alone. A metal they explain as a dark dielectric too, and the
     regulariser prefers that, as published."""
@@ -124,6 +126,7 @@ def test_free_cells_see_what_the_prior_does_not(tmp_path, llvm):
     assert not opened(tmp_path, "affines").has("camera_response.parquet")
 
 
+@pytest.mark.long
 def test_both_solvers_and_same_bytes_twice(ldr):
     folder = ldr[0]
     for model in ("fipt", "iris"):

@@ -56,6 +56,7 @@ def test_reference_loss_does_not_reward_shrinking():
     assert abs(at[4.0][0]) < 0.02
 
 
+@pytest.mark.long
 def test_twins_are_judged_by_one_loss(planted):
     scene, photographs, transport = planted
     problem, initial = scene.problem(photographs, transport, "hdr_hidden")

@@ -89,6 +89,7 @@ def test_polishing_lowers_the_papers_loss():
     assert abs(totals[-1] - totals[-2]) < 0.01 * totals[-1]
 
 
+@pytest.mark.long
 def test_direct_is_not_above_the_papers_optimiser_on_the_papers_loss():
     """Both use one selection, and the optimiser runs until its loss is flat."""
     problem, _ = simulated()

@@ -88,6 +88,7 @@ def automatic(p, options, temperature=0.3, divisor=0.7):
     return {name: float(found[name].detach()) for name in TERMS}, slopes, found["error"].numpy()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("k", [1, 2, 5, 16])
 @pytest.mark.parametrize(
     "options",
@@ -152,6 +153,7 @@ def test_clamped_values_have_an_inward_gradient_or_none():
     assert compiled(p, sgd_options(regulariser=0.0, scale_floor=0.5))[1]["affine"][0, 0, 3] >= 0
 
 
+@pytest.mark.long
 def test_single_precision_is_close():
     p = state(16, n=3000, segments=7)
     options = sgd_options("paper", median_gradient=False)  # the median may be another element
@@ -161,6 +163,7 @@ def test_single_precision_is_close():
         np.testing.assert_allclose(slopes[name], expected[name], atol=2e-5 * np.abs(expected[name]).max())
 
 
+@pytest.mark.long
 def test_half_precision_pools_are_read_as_they_are():
     p = state(6, n=100)
     options = sgd_options()
@@ -201,6 +204,7 @@ def test_exponential():
     assert ends[0] == ends[1] == 1 and (0 <= ends[2:4]).all() and (ends[2:4] < 2e-38).all() and np.isfinite(ends[4])
 
 
+@pytest.mark.long
 def test_adam_is_that_of_torch():
     rng = np.random.default_rng(0)
     start = rng.standard_normal(1000).astype(np.float32)
@@ -276,6 +280,7 @@ def test_a_descent_goes_on_from_the_end_of_any_epoch(texture, threads):
         assert fit.history == whole.history
 
 
+@pytest.mark.long
 def test_loss_falls_in_the_history():
     problem, truth = simulated()
     calls = []
@@ -324,6 +329,7 @@ def test_good_predictions_are_selected_and_the_texture_found():
     assert oracle_psnr(problem, fit.value, truth) > 38
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("preset", ["safe", "paper"])
 def test_loss_of_the_solver_is_the_reference_loss(preset, monkeypatch):
     """With all pixels in one batch and steps of size 0, the first history entry is the loss of the result."""
@@ -355,6 +361,7 @@ def test_loss_with_moved_corrections_is_the_reference_loss():
         np.testing.assert_allclose(mapped[:, channel], gain * base[:, channel] + bias, rtol=1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("preset", ["safe", "paper"])
 def test_steps_are_those_of_automatic_differentiation(preset, monkeypatch):
     problem, _ = simulated()
@@ -486,6 +493,7 @@ def on_a_wall(problem):
     return replace(problem, point=points, tangent=lambda view: tangents[view])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("preset", ["safe", "paper"])
 def test_hash_grid_texture(preset):
     problem, truth = simulated()

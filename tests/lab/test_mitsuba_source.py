@@ -494,6 +494,7 @@ def test_more_views_see_no_less(load):
     assert seen[0]["coverage_3"] == 0 < seen[2]["coverage_3"]
 
 
+@pytest.mark.long
 def test_the_path_does_not_leave_the_room_of_the_sensor(load):
     """A second, closed room next to the first is not reachable."""
     other = box((4.2, 0, 0), (9, 3, 2.5)).replace('id="box"', 'id="box2"')
@@ -502,6 +503,7 @@ def test_the_path_does_not_leave_the_room_of_the_sensor(load):
     assert (found.poses[:, 0, 3] < 4).all()
 
 
+@pytest.mark.long
 def test_a_tiny_room_and_an_open_floor_still_give_a_path(load):
     _, small, _ = load(box((0, 0, 0), (0.9, 0.8, 2.2)))
     found, *_ = plan(small, 4, start=(0.45, 0.4, 1.5))
@@ -513,6 +515,7 @@ def test_a_tiny_room_and_an_open_floor_still_give_a_path(load):
     assert (found.poses[:, 2, 3] > 0.9).all()
 
 
+@pytest.mark.long
 def test_a_room_in_millimetres_is_remarked_and_still_planned(load):
     _, mesh, _ = load(box((0, 0, 0), (4000, 3000, 2500)))
     found, *_ = plan(mesh, 5, unit=1000.0)
@@ -677,6 +680,7 @@ def test_capture_of_a_tiny_scene(llvm, tmp_path, monkeypatch):
     assert digests(again) == digests(reader)
 
 
+@pytest.mark.long
 def test_a_killed_capture_goes_on_where_it_was(llvm, tmp_path, monkeypatch):
     """Also where a pixel has no finite sample and where a finished view was damaged meanwhile."""
     from lab.mitsuba_scene import render
@@ -704,6 +708,7 @@ def test_a_killed_capture_goes_on_where_it_was(llvm, tmp_path, monkeypatch):
     assert resumed.reader.manifest["files"] == undisturbed.reader.manifest["files"]
 
 
+@pytest.mark.long
 def test_capture_hdr_with_glass_kept(llvm, tmp_path, monkeypatch):
     reader = capture(tmp_path, monkeypatch, ROOM + PANE, ", dynamic_range: hdr", ", drop_transparent: false")
     assert len(reader.mesh()[1]) == 12 + 2 + 2 and reader.is_hdr and "response_truth" not in reader.facts
@@ -715,6 +720,7 @@ def test_capture_hdr_with_glass_kept(llvm, tmp_path, monkeypatch):
     assert pane.any() and np.array_equal(~truth.valid, pane)
 
 
+@pytest.mark.long
 def test_lights_that_are_not_surface_are_noted(llvm, tmp_path, monkeypatch):
     body = (
         ROOM
@@ -726,6 +732,7 @@ def test_lights_that_are_not_surface_are_noted(llvm, tmp_path, monkeypatch):
     assert any("PointLight" in note for note in reader.facts["notes"])
 
 
+@pytest.mark.long
 def test_one_sided_surface_has_no_truth_behind(llvm, tmp_path, monkeypatch):
     card = """<shape type="rectangle" id="card"><transform name="to_world"><rotate y="1" angle="90"/>
       <translate x="2.2" y="1.6" z="1.3"/></transform><bsdf type="diffuse"/></shape>"""  # away from the sensor
@@ -780,6 +787,7 @@ def test_modern_hall(llvm, test_scene):
     assert glass.sum() == 36 and {mesh.shapes[i].name for i in mesh.shape[glass]} == {"Glass/Mesh014"}
 
 
+@pytest.mark.long
 @pytest.mark.needs_scene
 def test_modern_hall_path(llvm, test_scene):
     from lab.mitsuba_scene import flatten, scene

@@ -34,6 +34,7 @@ def test_crops_are_cut_from_the_inputs_of_the_product(capture):
         assert np.array_equal(capture.truth.stacked(view)[:, top : top + 32, left : left + 32], made.truth[number])
 
 
+@pytest.mark.long
 def test_what_is_on_disk_is_not_made_again(maker, monkeypatch):
     assert maker.make_all(range(50, 52)) == 2
     files = {seed: path.stat().st_mtime_ns for seed, path in shards.crop_files(maker.folder.path)}
@@ -113,6 +114,7 @@ def test_light_is_gathered_again_with_roughly_known_albedo(capture):
     assert 0.02 < ratio.std() < 0.5 and np.isnan(known(once, 0)[~counts]).all()
 
 
+@pytest.mark.long
 def test_the_response_of_photographs_that_are_read_smaller_is_that_of_their_pixels(llvm, room):
     # Photographs much larger than those of the training are read at half or a third of their size; the last block is not full.
     capture = photographs.photograph(room, 5, photographs.Session(4, 251, 1))

@@ -55,6 +55,7 @@ def digests(reader):
     }
 
 
+@pytest.mark.long
 def test_emission_is_a_radiance_for_every_bright_triangle(finished):
     _, readers = finished
     facts, table, faces = (
@@ -93,6 +94,7 @@ def test_materials_are_fitted_to_all_pixels(finished):
     assert facts["response"]["family"] == "ggcm"
 
 
+@pytest.mark.long
 def test_a_killed_descent_goes_on_where_it_was(finished, tmp_path, monkeypatch):
     from lab.published.light import single_bounce
 

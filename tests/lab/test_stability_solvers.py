@@ -9,6 +9,7 @@ from lab.stability import rows, solvers, sums
 from lab.stability.sums import Summed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("solver", solvers.SOLVERS, ids=lambda solver: solver.__name__)
 def test_solvers_are_backward_stable_or_name_their_guard(solver):
     found = list(solver())
@@ -26,6 +27,7 @@ def test_the_camera_response_is_found_from_exact_values():
     assert error["gamma 1.9, 3 levels"] < 0.05
 
 
+@pytest.mark.long
 def test_every_known_limit_occurs():
     kinds = {(one.solver, one.kind) for one in solvers.table() if one.backward > solvers.BACKWARD_LIMIT}
     assert rows.LIMITS == kinds
@@ -52,6 +54,7 @@ def test_backward_and_forward_error_measure_what_they_say():
     assert solvers.relative_error(solvers.exact_solution(matrix, right), x) < 1e4 * 10 * solvers.EPS
 
 
+@pytest.mark.long
 def test_sums_are_within_their_bounds(llvm):
     found = list(sums.table(30_000))
     assert {one.way for one in found} == set(sums.WAYS) and {one.terms for one in found} == set(sums.KINDS)

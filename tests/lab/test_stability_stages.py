@@ -40,6 +40,7 @@ def _shown(capture):
     return set(capture.instance[faces[faces >= 0]].tolist()) - {-1}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("relation", RELATIONS, ids=lambda relation: relation.name)
 def test_changed_captures_show_the_same_room(room, relation):
     capture, result, _ = room
@@ -75,6 +76,7 @@ def _seen(capture):
     return {view.name: capture.face[view.name] >= 0 for view in capture.views}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "allowed"),
     [
@@ -93,6 +95,7 @@ def test_stages_find_the_same_room_again(room, name, allowed):
     assert found.albedo < allowed and found.light < max(allowed, 1e-5), found
 
 
+@pytest.mark.long
 def test_the_last_bit_of_the_mesh_does_not_draw_the_light_anew(room):
     capture, reference, folder = room
     result = chain.run(digits.one_ulp(capture, np.random.default_rng(3)), folder / "moved")

@@ -58,6 +58,7 @@ def test_leverage_of_the_response():
         np.testing.assert_allclose(reduced[k], grown[16:] - coupling[0].T @ inverse @ grown[:16], rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.long
 def test_a_prior_that_decides_the_response_gives_it_its_error():
     problem, _ = planted(0, 3)
     mean, deviation = np.array([1.93]), 0.04

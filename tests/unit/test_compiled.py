@@ -11,6 +11,7 @@ import pkgutil
 import subprocess
 import sys
 
+import pytest
 from numba.core.dispatcher import Dispatcher
 
 import iif_core
@@ -57,6 +58,7 @@ def test_every_loop_called_by_another_is_inlined():
     assert not apart
 
 
+@pytest.mark.long
 def test_fresh_and_cached_code_give_the_same_bytes(tmp_path):
     run = [
         subprocess.run(

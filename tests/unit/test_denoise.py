@@ -26,5 +26,6 @@ assert denoise(noisy, flat, flat).shape == noisy.shape
 """
 
 
+@pytest.mark.long
 def test_denoiser_leaves_torch_alone(repository):
     subprocess.run([sys.executable, "-c", DENOISED], cwd=repository, check=True)

@@ -92,6 +92,7 @@ def sampled(kind, folder, view=0, capture=None, seed=0, **keys):
 # --------------------------------------------------------------------------------------------------------------- sampling
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", MODULES)
 def test_a_batch_is_what_its_samples_are_alone(made, kind):
     together = sampled(kind, made[kind], batch=4)
@@ -163,6 +164,7 @@ def test_rgbx_is_ddim_by_hand(made):
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+@pytest.mark.long
 def test_marigold_is_the_pipeline_of_diffusers(made):
     """Compare with diffusers' own pipeline on the same noise."""
     from diffusers import MarigoldIntrinsicsPipeline
@@ -199,6 +201,7 @@ def test_marigold_says_what_its_channels_are(made):
     assert marigold.layout({"target_properties": turned}) == expected
 
 
+@pytest.mark.long
 def test_every_size_and_tiles(made):
     rng = np.random.default_rng(0)
     for height, width, longest in ((3, 50, 100), (1, 1, 64), (130, 70, 70)):

@@ -90,6 +90,7 @@ def test_setting_changes_stage_and_below(checkout):
     assert changed(before, fingerprints(code, run)) == below("shading")
 
 
+@pytest.mark.long
 def test_unrelated_comment_in_scene_file_changes_nothing(checkout):
     code, run = checkout
     before = fingerprints(code, run)
@@ -97,6 +98,7 @@ def test_unrelated_comment_in_scene_file_changes_nothing(checkout):
     assert changed(before, fingerprints(code, run)) == set()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("prior", ["learned", "retinex"])
 def test_a_plan_loads_no_compiler(checkout, prior):
     """Snakemake asks for the fingerprints of all stages whenever it is called, so plug-ins must not load what only jobs need."""
@@ -178,6 +180,7 @@ def test_raw_digest_follows_content_not_time(tmp_path, monkeypatch):
     assert fp.raw_digest([photo]) != first
 
 
+@pytest.mark.long
 def test_weights_of_vgg_count_where_they_are_read(checkout):
     code, run = checkout
     weights = run / "results/weights/lpips_vgg.npz"
@@ -194,6 +197,7 @@ def test_weights_of_vgg_count_where_they_are_read(checkout):
     assert with_and_without() == below("base_scores") | below("metrics")
 
 
+@pytest.mark.long
 def test_what_is_remembered_of_the_code_changes_nothing(checkout):
     """Without, with, and with a damaged memory: the same; an edit that keeps size and time stamp is seen."""
     code, run = checkout

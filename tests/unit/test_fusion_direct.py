@@ -591,6 +591,7 @@ def test_a_segment_in_two_views_is_refused():
         solve_direct(replace(problem, segment_of_pixel=same))
 
 
+@pytest.mark.long
 def test_same_bytes_whatever_the_threads_of_blas():
     """Uses odd sizes that OpenBLAS spreads over threads; their number is fixed when NumPy is imported."""
     program = """

@@ -121,6 +121,7 @@ def test_millimetres_and_kilometres_make_the_same_cells(unit):
     assert (keys[0] == keys[1]).all(1).mean() > 0.995  # float32 rounds a few points over a face
 
 
+@pytest.mark.long
 def test_memory_bound_changes_nothing(tmp_path):
     """Predictions that do not fit into memory are read again, or mapped from a file, and give the same bytes."""
     problem, _ = simulated()

@@ -156,6 +156,7 @@ def test_vgg_layers_by_shape(vgg):
     assert 0.01 < value < 2 and lpips(image(1), image(1), vgg, network="vgg") == 0
 
 
+@pytest.mark.long
 def test_stage_scores_what_is_looked_at_with_the_learned_metrics(alex, vgg):
     """VGG: albedo of result, base and first prediction, raw and scaled; the result alone has AlexNet everywhere."""
     from workflow.scoring.of_views import _scores

@@ -426,6 +426,7 @@ def test_what_was_parted_or_joined_is_of_masks_as_what_it_was_elected_into():
     assert voted.tolist() == [True] and agreement[0] == pytest.approx((3 * 0.5 + 2 * 0.9 + 1) / 6)
 
 
+@pytest.mark.long
 def test_spoilt_masks_make_pure_objects(photographed):
     root, _, things, capture = photographed
     vertices, faces = capture.mesh()

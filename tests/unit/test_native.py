@@ -168,6 +168,7 @@ def test_process_environment_of_an_empty_environment(repository):
     assert os.path.isabs(home)
 
 
+@pytest.mark.long
 def test_limit_threads_reaches_libraries_imported_before_and_after(repository):
     code = (
         "import os, torch\n"

@@ -61,6 +61,7 @@ def test_the_good_scene_is_done_and_the_bad_ones_are_named(ended):
     assert page.count('src="pictures/tiny.') == 1 and '"../../scenes/tiny/report.html"' in page
 
 
+@pytest.mark.long
 def test_what_is_left_runs_when_the_table_is_mended_and_then_nothing_does(ended):
     ended.table.write_text(HEADER + "tiny\nmm\t\t\tother\tseed=1\n")
     (ended.folder / "config/scenes/other.yaml").write_text((ended.folder / "config/scenes/tiny.yaml").read_text())
@@ -98,6 +99,7 @@ def copied(finished, tmp_path_factory):
     return workflow
 
 
+@pytest.mark.long
 def test_prepared_scenes_are_sound_and_finished(copied):
     """What benchmarks of large batches rest on: such a scene is to everybody what a computed one would be."""
     verified = copied.run("verify")
@@ -109,6 +111,7 @@ def test_prepared_scenes_are_sound_and_finished(copied):
     assert len(marks) == 3
 
 
+@pytest.mark.long
 def test_one_scene_is_delivered_before_the_next_goes_on(copied):
     """So that a batch that is stopped has delivered what it could."""
     made = {name: [copied.folder / f"results/{name}/{stage}/manifest.json" for stage in ("metrics", "report")] for name in "ab"}
@@ -122,6 +125,7 @@ def test_one_scene_is_delivered_before_the_next_goes_on(copied):
     assert first[0] < first[1] < first[2] < second[0] < second[1] < second[2]
 
 
+@pytest.mark.long
 def test_a_prepared_scene_is_made_again_where_it_is_edited_or_damaged(copied):
     table = copied.folder / "config/batch.tsv"
     kept = table.read_text()

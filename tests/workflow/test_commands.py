@@ -33,6 +33,7 @@ def test_the_linter_has_nothing_to_say(fresh):
     succeeded(fresh.run("--lint"))
 
 
+@pytest.mark.long
 def test_commands_that_run_nothing_know_the_default_target(fresh):
     assert "scenes/tiny" in succeeded(fresh.run("--summary"))
     assert "FROM " in succeeded(fresh.run("--containerize"))
@@ -43,6 +44,7 @@ def test_commands_that_run_nothing_know_the_default_target(fresh):
     assert wanted <= edges and ("publish", "batch") in edges
 
 
+@pytest.mark.long
 def test_a_folder_without_scenes_knows_those_of_the_repository(repository, tmp_path):
     elsewhere = Workflow(repository, tmp_path)
     assert "publishing scenes/kitchen" in succeeded(elsewhere.run("scenes/kitchen", "-n"))
@@ -60,6 +62,7 @@ def copy_of(repository, checkout):
     return checkout
 
 
+@pytest.mark.long
 def test_results_do_not_depend_on_where_the_checkout_lies_and_how_it_is_named(repository, finished, tmp_path):
     moved = finished.copy(tmp_path / "run")
     moved.repository = Path(os.path.relpath(copy_of(repository, tmp_path / "checkout")))
@@ -78,6 +81,7 @@ def test_a_checkout_may_have_a_space_in_its_path(repository, tmp_path):
     assert "a copy/envs/iif.sif" in image.stdout + image.stderr
 
 
+@pytest.mark.long
 def test_the_image_is_named_where_it_is_asked_for(fresh):
     """The next step, which looks for apptainer, is Snakemake's own."""
     asked = fresh.run("scenes/tiny", "-n", "--sdm", "apptainer")
@@ -112,6 +116,7 @@ def test_status_is_asked_without_snakemake(fresh):
     assert result.returncode == 1 and "Ask `python -m workflow status`" in result.stderr.strip().splitlines()[-1]
 
 
+@pytest.mark.long
 def test_a_profile_that_is_not_there_is_one_error(fresh, monkeypatch):
     """Snakemake passes over it, and a run that was meant for a cluster would compute where it was called."""
     monkeypatch.setenv("PWD", os.getcwd())
@@ -120,6 +125,7 @@ def test_a_profile_that_is_not_there_is_one_error(fresh, monkeypatch):
     named(error_of(result), "--workflow-profile workflow/profiles/slurm-scene", os.getcwd(), "workflow/profiles/slurm-scenes")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("target", ["plan/tiny", "relight/tiny"])
 def test_a_link_in_the_place_of_a_folder_is_one_error(fresh, target):
     path = fresh.folder / target

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from tests.errors import named, refused
 from workflow.artifacts import StageReader
@@ -36,6 +37,7 @@ def hand_over(folder: Path, maps: Path) -> None:
         write_exr(maps / f"rgb/{view}.exr", split_rgb(rgb(channels)))
 
 
+@pytest.mark.long
 def test_our_own_maps_score_as_stage_metrics_says(workflow):
     hand_over(workflow.folder, workflow.folder / "mine")
     result = workflow.run("score/tiny", "--config", "maps=mine")
@@ -72,6 +74,7 @@ def test_the_maps_of_a_finished_scene_are_maps(workflow):
         find(workflow.folder / "scenes/tiny/maps", "auto", views[:-1])
 
 
+@pytest.mark.long
 def test_maps_that_are_not_there_stop_before_any_job(workflow):
     named(fails(workflow, "score/tiny"), "score/tiny", "--config maps=<folder>")
     named(fails(workflow, "score/tiny", "--config", "maps=nowhere"), "--config maps=nowhere")
@@ -110,12 +113,14 @@ def test_a_result_beside_itself_and_beside_another(workflow):
     assert set(differing["part"]) == {"settings", "objects"}
 
 
+@pytest.mark.long
 def test_results_that_are_not_there_stop_before_any_job(workflow):
     named(fails(workflow, "compare/tiny,tinny"), "config/scenes/tinny.yaml", "tiny")
     shutil.rmtree(workflow.folder / "results/tiny/affines")
     named(fails(workflow, "compare/tiny,tiny"), "results/tiny", "affines")
 
 
+@pytest.mark.long
 def test_the_tiny_room_under_new_light(workflow):
     path = workflow.folder / "config/scenes/tiny.yaml"
     path.write_text(path.read_text() + "relit: {views: 1, lamps: 1, spheres: 1, samples: 64}\n")

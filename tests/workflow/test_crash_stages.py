@@ -18,6 +18,7 @@ def trials(workflow, folder, *stages):
     return {row["stage"]: row for row in map(json.loads, found.stdout.splitlines())}
 
 
+@pytest.mark.long
 def test_stages_killed_and_failing_at_some_calls(finished, tmp_path):
     found = trials(finished, tmp_path, "prior=6", "segmentation=6", "publish=8")
     assert sum(row["points"] for row in found.values()) == 20 and not any(row["wrong"] for row in found.values())

@@ -37,6 +37,7 @@ def test_a_setting_reruns_its_stage_and_those_below(workflow):
     assert [line.split(" ")[0] for line in forecast if line] == said
 
 
+@pytest.mark.long
 def test_failed_run_does_not_leave_the_old_deliverable_as_up_to_date(workflow):
     """A parameter changes, the first affected job fails, the same command comes again: everything below must be rebuilt."""
     path = workflow.folder / "config/scenes/tiny.yaml"
@@ -86,6 +87,7 @@ def test_edited_deliverable_is_found(workflow):
     assert planned(workflow.run("scenes/tiny", "-n")) == {"publish"}
 
 
+@pytest.mark.long
 def test_published_files_that_are_gone_are_named_and_published_again(workflow):
     deliverable = workflow.folder / "scenes/tiny"
     before = {path.name: path.read_bytes() for path in deliverable.glob("maps/*")}
@@ -105,6 +107,7 @@ def test_published_files_that_are_gone_are_named_and_published_again(workflow):
     assert NOTHING in workflow.run("scenes/tiny").stderr
 
 
+@pytest.mark.long
 def test_what_publishing_left_is_made_by_publishing_again(workflow):
     """The record of stage publish is no output of a rule; and a deliverable can be sound and not the one that is wanted."""
     record, deliverable = workflow.folder / "results/tiny/publish/published.json", workflow.folder / "scenes/tiny/manifest.json"
@@ -117,6 +120,7 @@ def test_what_publishing_left_is_made_by_publishing_again(workflow):
     assert planned(workflow.run("scenes/tiny", "-n")) == {"publish"}
 
 
+@pytest.mark.long
 def test_the_last_line_is_the_reason_of_the_failed_job(workflow):
     """Also where several jobs fail, and after a run that failed for another reason."""
     folder = workflow.folder

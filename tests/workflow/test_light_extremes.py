@@ -258,6 +258,7 @@ class CurtainRoom(Room):
         self.transmittance[self.object_id == self.names.index("curtain")] = 0.5
 
 
+@pytest.mark.long
 def test_curtain_lets_light_through(tmp_path, llvm):
     room = build(tmp_path, truth=True, views=6, size=32, samples=1024, room=CurtainRoom(), sky=6.0)
     found = _run(tmp_path, "hdr", upto="report", rows=6000, samples=64)

@@ -166,6 +166,7 @@ def test_halves_are_independent(hdr):
     assert not np.array_equal(first, second)
 
 
+@pytest.mark.long
 def test_specular_light_is_traced_where_the_fit_reads_it(hdr):
     """A draw of 600 pixels: no more are traced, evenly over the objects, and the fit has exactly these."""
     folder, _ = hdr
@@ -250,6 +251,7 @@ def test_measured_response_is_used_as_it_is(tmp_path, llvm, monkeypatch):
     assert decision["component"] == "camera_response" and "crf.npy" in decision["reason"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("dynamic_range", "brightness"),
     [

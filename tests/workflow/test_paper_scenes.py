@@ -19,6 +19,7 @@ def table(repository):
     return (repository / "config/paper-scenes.tsv").read_text()
 
 
+@pytest.mark.long
 def test_nine_scenes_lack_nothing_but_their_data(workflow, table):
     (workflow.folder / "config/batch.tsv").write_text(table)
     lines = read_table(workflow.folder)

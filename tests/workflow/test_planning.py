@@ -2,6 +2,7 @@
 
 import json
 
+import pytest
 import yaml
 from support import planned
 
@@ -29,6 +30,7 @@ def test_the_plan_needs_capture_alone_and_is_shown(workflow):
     assert 0 < probes["points"] <= 2000 and probes["escape_share"] == {"primary": 0.0, "secondary": 0.0}
 
 
+@pytest.mark.long
 def test_what_is_left_out_is_not_done_and_its_reruns_are_the_least(workflow):
     path = workflow.folder / "config/scenes/tiny.yaml"
     text = path.read_text()

@@ -67,6 +67,7 @@ def test_relighting_is_made_on_demand(workflow):
     assert [stamp(of) for of in kept] == stamps
 
 
+@pytest.mark.long
 def test_plans_stand_beside_the_relightings_of_a_scene(workflow):
     """A plan, the example for scenes without relightings, a second scene, and what cannot be asked for."""
     plans = workflow.folder / "config/relight"
@@ -111,6 +112,7 @@ def test_mistakes_stop_before_any_job(workflow, text, names):
     assert "rule lamp_images" not in result.stderr
 
 
+@pytest.mark.long
 def test_a_correction_by_hand_reruns_the_fit_alone(workflow):
     path = workflow.folder / "config/scenes/tiny.yaml"
     text = path.read_text()

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 
+import pytest
 from support import manifests, planned
 
 from tests.errors import missing, named
@@ -25,6 +26,7 @@ def alone(workflow, *arguments):
     return subprocess.run(command, cwd=workflow.folder, capture_output=True, text=True, env=environment)
 
 
+@pytest.mark.long
 def test_parts_make_the_result_of_one_job(workflow):
     """To the byte, with the same fingerprint. A finished prior is not made again because other parts are asked for, or none."""
     folder = workflow.folder
@@ -63,6 +65,7 @@ def test_a_part_makes_its_views_alone_and_goes_on_after_a_kill(workflow):
         assert refused.returncode == 1 and refused.stderr.startswith(f"error: --part {text}: ")
 
 
+@pytest.mark.long
 def test_a_prior_that_would_repeat_work_is_not_scattered(workflow):
     path = workflow.folder / "config/scenes/tiny.yaml"
     path.write_text(path.read_text().replace("prior: {kind: simulated, samples: 3, strength: 0.5}", "prior: {kind: retinex}"))

@@ -8,6 +8,8 @@ import subprocess
 import sys
 import time
 
+import pytest
+
 from workflow.runtime.job_state import state_file
 
 ROOM = "room"
@@ -26,6 +28,7 @@ def scene_line(workflow):
     return line
 
 
+@pytest.mark.long
 def test_status_is_told_while_a_run_holds_the_folder(workflow):
     folder = workflow.folder
     assert scene_line(workflow).split()[1] == "done"

@@ -7,6 +7,7 @@ import pytest
 from support import planned
 
 
+@pytest.mark.long
 def test_a_time_chooses_a_quality_and_says_what_is_expected(workflow):
     result = workflow.run("-n", "scenes/tiny", "--config", "quality=600s")
     assert result.returncode == 0, result.stderr[-4000:]
@@ -17,6 +18,7 @@ def test_a_time_chooses_a_quality_and_says_what_is_expected(workflow):
     assert planned(same) == planned(result) and f"quality {found[1]}, at most " in same.stderr
 
 
+@pytest.mark.long
 def test_what_cannot_be_had_ends_before_any_job_with_one_error(workflow):
     for asked, words in (
         ("quality=3s", "error: --config quality=3s: tiny is expected to take longer on this machine"),

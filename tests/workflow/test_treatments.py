@@ -14,6 +14,7 @@ def _without_emitters(workflow, target):
     return json.loads((workflow.folder / "results/tiny/emission/emission.json").read_text())["notes"]
 
 
+@pytest.mark.long
 def test_no_emitter_seen(workflow):
     """Nothing counts as an emitter: light comes from the radiance cache alone, and the stage says so."""
     assert treatment("no emitter seen") in _without_emitters(workflow, "results/tiny/affines/manifest.json")
