@@ -78,7 +78,8 @@ def capture_photographs(job: Job, inputs: Inputs) -> None:
     if not taken.views:
         raise InputError(_sees_nothing(task, taken))
     said += notes.of_dropped(taken.dropped, len(frames))
-    said += notes.of_blank(inputs.transforms.path, taken.blank, len(taken.views))
+    used = sum(view.split != "test" for view in taken.views)
+    said += notes.of_blank(inputs.transforms.path, taken.blank, used)
     said += _checked_alignment(task, taken)
     views = taken.views
     if settings.exposure == "estimate":
@@ -211,9 +212,9 @@ def _registered(
         if (face >= 0).mean() < MIN_COVERAGE:
             continue
         one = photograph(frame, view, task.encoded, gains[i])
-        forms += [(one.form, frame.name)] * bool(one.form)
-        camera = (view.fx, view.fy), (view.cx, view.cy), pose
         held = task.splits[i] == "test"
+        forms += [(one.form, frame.name)] * bool(one.form and not held)
+        camera = (view.fx, view.fy), (view.cx, view.cy), pose
         photos[-1] = Photo(one.pixels, one.valid, depth, task.room.normals_of(face), *camera, held)
         job.progress(i + 1, len(frames), "photographs registered")
     return registration.register_frames(frames, poses, photos, task.conventions.axes, task.inputs.metres), forms
@@ -235,26 +236,28 @@ def _take(job: Job, task: _Task, posed: registration.Registered, gains: list[flo
             out.blind.append((frame, view))
             continue
         one = photograph(frame, view, task.encoded, gains[i])
+        seen = one.without_black(task.encoded)
+        writer.gbuffer(view.name, depth, face)
+        _write_photograph(task, writer, frame, view, seen, face)
+        out.views.append(view)
+        out.frames.append(frame)
+        job.progress(i + 1, len(frames), "photographs")
+        if view.split == "test":  # a held-out photograph is copied, and nothing is found out about it
+            continue
         out.counts.update(one.counts)
         out.forms += [(one.form, frame.name)] * bool(one.form)
         if not one.valid.any():
             out.notes.append(f"view {view.name}: no usable pixel (all transparent, masked or NaN)")
         if blank := one.blank(task.encoded):
             out.blank[blank].append(view.name)
-        one = one.without_black(task.encoded)
-        writer.gbuffer(view.name, depth, face)
-        _write_photograph(task, writer, frame, view, one, face)
         if task.source.alignment != "off":
             out.aligned.add_depth(frame, task.conventions, pinhole(view), depth, task.inputs.transforms.depth_unit)
-            edges = alignment.edge_pictures(one.pixels, one.valid, depth, task.room.normals_of(face))
+            edges = alignment.edge_pictures(seen.pixels, seen.valid, depth, task.room.normals_of(face))
             out.aligned.add_edges(frame.name, *edges, frame.name in compared)
-            out.trials += [_trial(frame, view, one)] * (frame.name in tried)
-        if task.settings.exposure == "estimate" and view.split != "test":
+            out.trials += [_trial(frame, view, seen)] * (frame.name in tried)
+        if task.settings.exposure == "estimate":
             points = view.world_from_camera[:3, 3] + depth[..., None] * view.directions()
-            shared.add(one.pixels, one.valid & (face >= 0), points, float(np.median(depth[face >= 0])) / view.fx)
-        out.views.append(view)
-        out.frames.append(frame)
-        job.progress(i + 1, len(frames), "photographs")
+            shared.add(seen.pixels, seen.valid & (face >= 0), points, float(np.median(depth[face >= 0])) / view.fx)
     return out
 
 
@@ -347,7 +350,7 @@ def _sees_nothing(task: _Task, taken: _Taken) -> str:
     tried = task.spread(alignment.TRIAL_VIEWS)
     better = _better_depth(task, taken.blind)
     if not better:
-        seen = [(f, v) for f, v in taken.blind if f.name in tried]
+        seen = [(f, v) for f, v in taken.blind if f.name in tried and v.split != "test"]
         better = _better_edges(task, [_trial(f, v, photograph(f, v, task.encoded, 1.0)) for f, v in seen], 0.0)
     listed = task.inputs.transforms
     return (
