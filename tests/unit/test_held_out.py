@@ -1,11 +1,13 @@
 """Held-out photographs: nothing that is fitted may depend on what they show."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 
 from tests.errors import refused
 from tests.unit import own_scene as own
+from workflow.artifacts.files import read_parquet
 from workflow.registry import STAGES
 from workflow.runtime.job import Job
 
@@ -26,6 +28,18 @@ def everything(root):
     return {str(p.relative_to(folder)): p.read_bytes() for p in files if p not in own}
 
 
+def rivals_are_scored(root):
+    """The room is as bright from everywhere, so the other photographs predict a held-out one well, at its own exposure."""
+    own.run(root, "render", "metrics")
+    table = read_parquet(Path(root) / "results/own/metrics/variants.parquet")
+    for variant in ("photo_mean", "photo_nearest"):
+        rows = (table["variant"] == variant) & (table["metric"] == "psnr")
+        assert set(table["view"][rows]) == set(HELD_OUT) and set(table["quantity"][rows]) == {"rgb_held_out"}
+        assert table["value"][rows].min() > 30, variant
+    for stage in ("render", "metrics"):
+        shutil.rmtree(Path(root) / "results/own" / stage)
+
+
 def with_noise(path):
     """Replace the held-out photographs by noise of the same size."""
     rng = np.random.default_rng(0)
@@ -40,6 +54,7 @@ def test_nothing_that_is_fitted_sees_a_held_out_photograph(tmp_path):
     capture = own.run(tmp_path, *FITTED)
     assert tuple(view.name for view in capture if view not in capture.used) == HELD_OUT
     first = everything(tmp_path)
+    rivals_are_scored(tmp_path)
     assert "base/maps/003.exr" in first and "prior/maps/003.exr" not in first and "affines/maps/003.exr" in first
     with_noise(path)
     capture = own.run(tmp_path, *FITTED)
