@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from iif_core.camera.interpolation import Shown, by_others
 from iif_core.camera.view import View
-from iif_core.evaluation.rivals import Shown, by_others
 from iif_core.surface.triangles import face_geometry, towards_viewer
 from tests.unit import own_scene as own
 

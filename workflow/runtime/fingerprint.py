@@ -182,6 +182,16 @@ def raw_digest(paths: list[Path]) -> str:
     return hashlib.sha256("\n".join(input_digests.digests(paths, _name_of)).encode()).hexdigest()[:16]
 
 
+def raw_contents(stage: str, document: dict[str, Any]) -> dict[str, str]:
+    """Return name -> SHA-256 of the files from outside that a stage reads.
+
+    Raises:
+        InputError: as `raw_inputs`.
+    """
+    paths = raw_inputs(stage, document) if STAGES[stage].reads_raw else []
+    return {name: digest for name, _, digest in (line.rpartition(":") for line in input_digests.digests(paths, _name_of))}
+
+
 def _name_of(path: Path) -> str:
     """Return the path; of a file of the program its place in the checkout, so that results do not depend on where that lies."""
     name = str(path)

@@ -59,6 +59,10 @@ class Planned:
         """Return what a stage is made as."""
         return fp.fingerprint(stage, scene, quality)
 
+    def raw(self, stage: str, document: dict[str, Any]) -> dict[str, str]:
+        """Return name -> SHA-256 of the files from outside that a stage reads."""
+        return fp.raw_contents(stage, document)
+
     def directory(self, stage: str, scene: str) -> Path:
         """Return the folder that a stage writes."""
         return stage_directory(scene, stage)
@@ -200,6 +204,7 @@ class Job:
             "code": fp.code_digest(self.stage.name, self.document),
             "seed": self.document["seed"],
             "inputs": inputs,
+            "raw": self._scenes.raw(self.stage.name, self.document),
             "device": self.device.facts(),
             "versions": library_versions(),
         }

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from iif_core.camera.interpolation import Shown, by_others
 from iif_core.camera.pixels import pixel_gains
 from iif_core.evaluation.consistency import held_out_gain
-from iif_core.evaluation.rivals import Shown, by_others
 from iif_core.light.emission.sensor import Sensor
 from iif_core.numerics.filling import fill_from_neighbours
 from iif_core.surface.triangles import face_geometry, towards_viewer
