@@ -59,6 +59,9 @@ class Loose(Planned):
     def fingerprint(self, stage: str, scene: str, quality: str) -> str:
         return self.MARK
 
+    def raw(self, stage: str, document: dict[str, Any]) -> dict[str, str]:
+        return {}
+
     def directory(self, stage: str, scene: str) -> Path:
         return self.written / stage
 

@@ -9,6 +9,7 @@ KINDS = {
     },
     "prior": {"simulated": ("lab.simulated.prior", "lab.settings.prior:SimulatedPrior")},
 }
+TRUTH = ("simulated",)
 ADDED = {
     "base_scores": {
         "does": "Score the base texture; made on demand by studies.",
@@ -17,6 +18,7 @@ ADDED = {
         "settings": (),
         "reads_raw": True,
         "files": ("lab.studies.weights",),
+        "scores": True,
     },
     "common_scores": {
         "does": "Score the result at views that all variants of a study share; made on demand by studies.",
@@ -24,6 +26,7 @@ ADDED = {
         "upstream": ("capture", "segmentation", "base", "emission", "second_look", "affines"),
         "settings": ("seed",),
         "shared": ("capture", "segmentation"),
+        "scores": True,
     },
     "relit_truth": {
         "does": "Render the source of a scene with truth under new light; made on demand by studies.",
@@ -32,12 +35,14 @@ ADDED = {
         "settings": ("source", "relit", "seed"),
         "reads_raw": True,
         "files": ("lab.relit.sources",),
+        "scores": True,
     },
     "relit_scores": {
         "does": "Render the result under new light and score it against the source; made on demand by studies.",
         "place": "lab.relit.scores",
         "upstream": ("capture", "segmentation", "base", "emission", "second_look", "affines", "relit_truth"),
         "settings": ("relit", "seed"),
+        "scores": True,
     },
 }
 SIZES = {"builtin": "lab.work:faces_of_room", "mitsuba": "lab.work:faces_of_files"}

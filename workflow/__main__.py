@@ -69,6 +69,8 @@ def _status(arguments: argparse.Namespace) -> int:
 
 def _verify(arguments: argparse.Namespace) -> int:
     from workflow.artifacts.verify import damaged, with_artefacts
+    from workflow.runtime.fingerprint import REPOSITORY
+    from workflow.runtime.input_digests import changed
     from workflow.runtime.job_state import written_out
     from workflow.settings.names import did_you_mean
 
@@ -78,7 +80,7 @@ def _verify(arguments: argparse.Namespace) -> int:
             f"{absent}: neither results/{absent} nor scenes/{absent} holds anything to verify."
             f"{did_you_mean(absent, known)} What is here: {', '.join(known) or 'nothing'}."
         )
-    problems = list(damaged(Path("."), scenes or None))
+    problems = [*damaged(Path("."), scenes or None), *changed(scenes or known, REPOSITORY)]
     for line in problems:
         print(written_out(line))
     nothing = "nothing to compare: no artefacts below results/ and scenes/"

@@ -11,6 +11,7 @@ holds nothing but names, so that it imports nothing, and defines any of
     ADDED    stage that is made on demand -> the arguments of its `Stage`
     SIZES    kind of source that is rendered -> function of its settings and of the faces of its mesh files -> faces
     COSTS    such a kind, or an added stage -> function of settings and size -> kind and counts (workflow/costs/work.py)
+    TRUTH    kinds of prior that are made of ground truth, whose scenes may therefore read it
     SCENES   folder of the checkout with further scene files
     DERIVED  module that derives further scenes (workflow/settings/derived.py), with `layers`, `bases`, `shared_scene` and
              `file_of_source`
@@ -111,8 +112,13 @@ def reads(stage: str) -> tuple[str, ...]:
     return tuple(key for name, keys in _entries("READS") if name == stage for key in keys)
 
 
+def made_of_truth() -> set[str]:
+    """Return the kinds of prior that are made of ground truth."""
+    return {kind for kinds in named("TRUTH") for kind in kinds}
+
+
 def named(name: str) -> list[str]:
-    """Return what plug-ins have under SCENES or QUALITY, which are folders of the checkout, or under DERIVED."""
+    """Return what plug-ins have under a name that is no table: SCENES or QUALITY, which are folders, TRUTH or DERIVED."""
     return [getattr(module, name) for module in modules() if hasattr(module, name)]
 
 

@@ -24,6 +24,7 @@ class Stage:
         on_demand: whether no scene needs it, only its own target or a plug-in.
         shared: stages whose files it reads in the folder of the scene that all derived scenes of a plug-in share.
         files: modules whose `raw_inputs` know (and check) further input files.
+        scores: whether it compares or shows the result, and so may read held-out photographs and ground truth.
         place: name of its module where that is not `workflow.stages.<name>`.
         threads: cores that its job takes, unless a profile says otherwise.
     """
@@ -36,6 +37,7 @@ class Stage:
     on_demand: bool = False
     shared: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
+    scores: bool = False
     place: str = ""
     threads: int = 2
 
@@ -142,6 +144,7 @@ STAGES: dict[str, Stage] = {
             "Render every view again with the recovered materials and lights.",
             ("capture", "segmentation", "base", "emission", "shading", "second_look", "affines"),
             ("render", "seed"),
+            scores=True,
         ),
         Stage(
             "lamp_images",
@@ -166,6 +169,7 @@ STAGES: dict[str, Stage] = {
             ("metrics",),
             reads_raw=True,
             files=("workflow.models.lpips",),
+            scores=True,
         ),
         Stage(
             "unwrap",
@@ -178,6 +182,7 @@ STAGES: dict[str, Stage] = {
             "Write the result for other programs: glTF, Mitsuba, tables.",
             ("capture", "segmentation", "base", "emission", "second_look", "affines", "unwrap"),
             ("export",),
+            scores=True,
             threads=1,
         ),
         Stage(
@@ -187,6 +192,7 @@ STAGES: dict[str, Stage] = {
             ("room", "report.credit", "seed"),
             reads_raw=True,
             files=("workflow.room.sources",),
+            scores=True,
         ),
         Stage(
             "report",
@@ -195,6 +201,7 @@ STAGES: dict[str, Stage] = {
             ("report",),
             reads_raw=True,
             files=("workflow.report.sources",),
+            scores=True,
             threads=1,
         ),
         Stage(
@@ -202,6 +209,7 @@ STAGES: dict[str, Stage] = {
             "Copy the deliverable to scenes/<scene>/.",
             (*_REPORTED, "report", "room"),
             (),
+            scores=True,
             threads=1,
         ),
         *(Stage(name, **facts, on_demand=True) for name, facts in plugins.added_stages().items()),

@@ -201,31 +201,6 @@ def choose_gains(rows: GainRows, n_views: int) -> CameraGains:
     return CameraGains(best.gain, best.vignetting, best.estimated, best.residual, evidence)
 
 
-def with_held_out_views(rows: GainRows, gains: CameraGains, moving: np.ndarray) -> CameraGains:
-    """Add the gains of held-out views, those not `moving` (V,): medians against the levels that the other views set."""
-    log_y = np.log(np.where(rows.y > 0, rows.y, np.nan))
-    flat = log_y - np.log(falloff(gains.vignetting, rows.radius2))[:, None]
-    size = int(rows.patch.max(initial=-1)) + 1
-    out, estimated = gains.gain.copy(), gains.estimated.copy()
-    # Views that moved set the levels; held-out ones are compared with them.
-    ahead = moving[rows.view] & gains.estimated[rows.view]
-    gap = np.full(flat.shape, np.nan)
-    for c in range(3):
-        use = ahead & np.isfinite(flat[:, c])
-        count = np.bincount(rows.patch[use], minlength=size)
-        total = np.bincount(rows.patch[use], flat[use, c] - np.log(gains.gain[rows.view[use], c]), size)
-        gap[:, c] = flat[:, c] - np.where(count > 0, total / np.maximum(count, 1), np.nan)[rows.patch]
-    shared = bool((gains.gain == gains.gain[:, :1]).all())
-    for v in np.flatnonzero(~moving):
-        own = gap[rows.view == v]
-        least = int(np.isfinite(own).sum(0).min())
-        estimated[v] = least >= MIN_ROWS
-        if estimated[v]:
-            # Without white balance in the model a view has one gain for all channels.
-            out[v] = np.exp(np.nanmedian(own) if shared else np.nanmedian(own, 0))
-    return CameraGains(out, gains.vignetting, estimated, gains.residual, gains.evidence)
-
-
 @dataclass(frozen=True)
 class _Entries:
     """One entry per (row, channel) with a value, on patches that two views share."""

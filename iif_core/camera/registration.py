@@ -45,7 +45,7 @@ class Photo:
         depth: (H, W) z-depth of the mesh in metres, 0 = miss; normal: (H, W, 3) unit, 0 = miss.
         focal: (fx, fy), principal: (cx, cy) in pixels, pixel centres at u + 0.5.
         pose: (4, 4) world_from_camera, OpenCV axes.
-        held: whether the photograph is kept for testing; it is aligned with the others and does not move them.
+        held: whether the photograph is kept for testing: it is aligned with the others, and changes nothing but its own pose.
     """
 
     image: np.ndarray
@@ -70,10 +70,12 @@ class Registration:
         edges: (before, after) mean photograph edge at held-out edges of the mesh.
         edge_gain, edge_error: its increase and the standard error over views.
         rows: (point, view) pairs compared.
-        accepted: whether the correction satisfies Eq. C.32 and there are at least MIN_VIEWS views.
-        sharpness: (V,) gradient of the texture relative to the other views; 1 = typical, 0 = not compared.
+        accepted: whether the correction satisfies Eq. C.32 and there are at least MIN_VIEWS views that are not held.
+        sharpness: (V,) gradient of the texture relative to the other views; 1 = typical, 0 = not compared, as all that are held.
         agreement: (V,) correlation of features with the mean of the other views, after registration; 0 = not compared.
         shift: (V,) remaining translation against the texture of the other views, in pixels (Eq. C.33).
+
+    All but `pose` and `moved` is of the photographs that are not held.
     """
 
     pose: np.ndarray
@@ -189,12 +191,15 @@ def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = T
 
     # -------- decision on held-out surface (Eq. C.32) --------
     maps = [_Maps.of(f, BLURS[-1]) for f in features]
-    unseen = [world[h] for world, h in zip(edges, held, strict=True)]
+    # Held photographs have no say: what is compared from here on is of the others.
+    moving = np.array([not p.held for p in photos])
+    rows = rows.take(moving[rows.view])
+    unseen = [world[h & own] for world, h, own in zip(edges, held, moving, strict=True)]
     spread, gain, error = _compare_features(photos, maps, (start, state), rows.take(rows.held_out))
     tied, edge_gain, edge_error = _compare_edges(photos, maps, (start, state), unseen)
     better = gain > 2.0 * error or (edge_gain > 2.0 * edge_error and gain > 0.0)
     worse = gain < -2.0 * error or edge_gain < -2.0 * edge_error
-    accepted = bool(better and not worse and len(photos) >= MIN_VIEWS)
+    accepted = bool(better and not worse and moving.sum() >= MIN_VIEWS)
     final = state if accepted else start
     return Registration(
         state.pose,
@@ -474,7 +479,7 @@ def normal_equations(
     # -------- sparse Jacobian (rows, 6 V + 3) --------
     # A held-out photograph changes its own twist only, not the intrinsics and not the levels.
     common *= moving[:, None]
-    mean = _level(value, weight * moving + 1e-9, rows.point)
+    mean = _level(value, (weight + 1e-9) * moving, rows.point)
     # Each row has nine entries: the twist of its view, and the three common unknowns.
     number = np.arange(len(value))
     at = 6 * rows.view[:, None] + np.arange(6)
@@ -498,7 +503,8 @@ def normal_equations(
     # -------- edges and priors, second to fourth sum of Eq. C.30 --------
     _add_edges(photos, maps, state, edges, normal, right)
     precision = np.r_[np.tile(np.repeat([SIGMA_ROTATION, SIGMA_TRANSLATION], 3), views), [SIGMA_PRINCIPAL] * 2, SIGMA_FOCAL] ** -2
-    precision *= max(len(value) / max(views, 1) / 200.0, 1.0)  # the errors of neighbouring rows are correlated
+    own = moving.sum() / max(sum(not p.held for p in photos), 1)
+    precision *= max(own / 200.0, 1.0)  # the errors of neighbouring rows are correlated
     # The prior pulls towards the given cameras, hence towards the negative sum of all steps so far.
     sum_of_steps = np.r_[state.twist.ravel(), state.principal, np.log(state.focal)]
     normal[np.diag_indices(size)] += precision

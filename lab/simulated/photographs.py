@@ -85,13 +85,15 @@ def exposures(
     stops: Sequence[float] = STOPS,
     grey: float = 0.18,
     saturated: float = 0.03,
+    used: Sequence[bool] | np.ndarray | None = None,
 ) -> np.ndarray:
     """Choose the exposure of every view, shorter for brighter views.
 
     Views are sorted by the mean luminance of their valid pixels and cut into len(stops) groups of nearly equal size, the
     brightest group with stops[0]. One common gain puts the geometric mean over views of stop x median luminance at `grey`. A
     view with more than the share `saturated` of its valid pixels above 1 in any channel is then reduced by whole thirds of
-    a stop. A black view keeps the exposure of its group.
+    a stop. A black view keeps the exposure of its group. A held-out view has no say in groups and gain; it joins the group of the
+    next darker view that is used.
 
     Args:
         radiance: linear radiance, one (..., 3) array per view, or one stack (V, ..., 3), or mean radiances (V, 3).
@@ -99,12 +101,13 @@ def exposures(
         stops: relative exposures of the groups, ascending, positive.
         grey: linear value of the median luminance of a typical view.
         saturated: share of pixels in [0, 1).
+        used: (V,) views that are not held out; all if None.
 
     Returns:
         (V,) float64, the factors that multiply radiance before the response.
 
     Raises:
-        InputError: no view, shapes that do not match, negative or non-finite radiance, stops not ascending.
+        InputError: no view, none used, shapes that do not match, negative or non-finite radiance, stops not ascending.
     """
     views = [np.asarray(r, np.float64) for r in radiance]
     if not views:
@@ -119,10 +122,15 @@ def exposures(
     bright = [luminance(p) for p in pixels]
     mean = np.array([y.mean() if len(y) else 0.0 for y in bright])
     median = np.array([np.median(y) if len(y) else 0.0 for y in bright])
-    order = np.argsort(-mean, kind="stable")
-    stop = np.empty(len(views))
-    stop[order] = stops[np.arange(len(views)) * len(stops) // len(views)] if len(views) > 1 else np.median(stops)
-    lit = median > 0
+    own = np.ones(len(views), bool) if used is None else np.asarray(used, bool)
+    count = np.count_nonzero(own)
+    if not count:
+        raise InputError("exposures: every view is held out; at least one must be used")
+    darkness = np.sort(-mean[own])
+    rank = np.minimum(np.searchsorted(darkness, -mean), count - 1)
+    rank[np.flatnonzero(own)[np.argsort(-mean[own], kind="stable")]] = np.arange(count)
+    stop = stops[rank * len(stops) // count] if count > 1 else np.full(len(views), np.median(stops))
+    lit = own & (median > 0)
     gain = grey / np.exp(np.mean(np.log(stop[lit] * median[lit]))) if lit.any() else 1.0
     return gain * stop * np.array([_closing(gain * s, p, saturated) for s, p in zip(stop, pixels, strict=True)])
 

@@ -146,7 +146,8 @@ class _Capture:
                 self.writer.photo(view.name, np.array(image), encoded=False)
             return views
         self.response = response_curve(RESPONSE)
-        gains = exposures([image for image, _ in meters], [mask for _, mask in meters])
+        used = [view.split != "test" for view in views]
+        gains = exposures([image for image, _ in meters], [mask for _, mask in meters], used=used)
         views = [replace(view, exposure=float(gain)) for view, gain in zip(views, gains, strict=True)]
         for view, image in zip(views, radiance, strict=True):
             self.writer.photo(view.name, expose(image, view.exposure, self.response))

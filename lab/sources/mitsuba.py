@@ -283,17 +283,18 @@ class _Capture:
         self.response = response_curve(RESPONSE) if encoded else None
         if encoded:
             metered, dark = zip(*self.meter, strict=True)
-            given = exposures(metered, dark)
+            given = exposures(metered, dark, used=[view.split != "test" for view in views])
             views = [replace(view, exposure=float(e)) for view, e in zip(views, given, strict=True)]
-        shared = SharedSurface(len(views), encoded)
+        own = [i for i, view in enumerate(views) if view.split != "test"]
+        shared = SharedSurface(len(own), encoded)
         for i, view in enumerate(views):
             pixels = view.width * view.height
             valid = np.unpackbits(self.usable[i], count=pixels).view(bool).reshape(view.height, view.width)
             image = expose(radiance[i], view.exposure, self.response) if encoded else np.array(radiance[i])
             self.writer.photo(view.name, image, valid, encoded)
-            if self.settings.exposure == "estimate":
+            if self.settings.exposure == "estimate" and i in own:
                 self._share(shared, view, image, valid)
-        return self._estimated(shared, views) if self.settings.exposure == "estimate" else views
+        return self._estimated(shared, views, own) if self.settings.exposure == "estimate" else views
 
     def _share(self, shared: Any, view: View, image: Array, valid: Array) -> None:
         from iif_core.light.transport.geometry import trace
@@ -305,13 +306,15 @@ class _Capture:
         footprint = float(np.median(t[face >= 0])) / view.fx if hit.any() else 1.0
         shared.add(image, valid & hit, points, footprint)
 
-    def _estimated(self, shared: Any, views: list[View]) -> list[View]:
-        """Return the views with exposures estimated from their photographs, and record the true ones in the facts."""
+    def _estimated(self, shared: Any, views: list[View], own: list[int]) -> list[View]:
+        """Return the views with exposures estimated from the photographs `own`, and record the true ones in the facts. The others
+        are held out and have 1, because scoring estimates theirs."""
         gains = shared.gains()
         self.facts["exposure_estimated"] = True
         self.facts["exposure_truth"] = [round(view.exposure, 8) for view in views]
         self.notes.append(f"exposures estimated from surface that views share (residual {gains.residual:.3f})")
-        return [replace(view, exposure=float(g)) for view, g in zip(views, gains.gain, strict=True)]
+        found = dict(zip(own, gains.gain, strict=True))
+        return [replace(view, exposure=float(found.get(i, 1.0))) for i, view in enumerate(views)]
 
     def _finish(self) -> None:
         if self.dropped:

@@ -160,3 +160,17 @@ def test_extremes_black_views_masked_views_all_black():
 def test_bad_input_is_named(arguments, names):
     with refused("exposures", *names):
         exposures(*arguments)
+
+
+def test_held_out_views_change_no_exposure_but_their_own():
+    rng = np.random.default_rng(4)
+    views = rng.uniform(0.01, 1, (10, 1, 1, 1)) * rng.random((10, 6, 5, 3))
+    used = np.arange(10) % 5 != 4
+    spoilt = np.where(used[:, None, None, None], views, 50 * rng.random(views.shape))
+    a, b = exposures(views, used=used), exposures(spoilt, used=used)
+    np.testing.assert_array_equal(a[used], b[used])
+    np.testing.assert_array_equal(a[used], exposures(views[used]))
+    twin = np.concatenate([views[:1], views[used]])
+    np.testing.assert_allclose(exposures(twin, used=np.arange(len(twin)) > 0)[0], exposures(views[used])[0])
+    with refused("held out"):
+        exposures(views, used=np.zeros(10, bool))

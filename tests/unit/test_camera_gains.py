@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from iif_core.camera.calibration.choice import calibrate_response
-from iif_core.camera.gains import CameraGains, GainRows, choose_gains, estimate, falloff, radius_squared, with_held_out_views
+from iif_core.camera.gains import CameraGains, GainRows, choose_gains, estimate, falloff, radius_squared
 from iif_core.camera.overlap import PatchRows
 from iif_core.camera.response import response
 from tests.errors import refused
@@ -79,16 +79,6 @@ def test_a_lens_that_falls_off_with_cos4():
     out = choose_gains(GainRows(rows.patch, rows.view, y, rows.radius2, rows.block), VIEWS)
     r2 = np.linspace(0, 1, 11)
     np.testing.assert_allclose(falloff(out.vignetting, r2), (1 + 0.45 * r2) ** -2.0, rtol=0.015)
-
-
-def test_held_out_views_follow_and_move_nobody():
-    rows, gain = planted(4)
-    moving = np.arange(VIEWS) != 3
-    ahead = choose_gains(rows.take(moving[rows.view]), VIEWS)
-    out = with_held_out_views(rows, ahead, moving)
-    np.testing.assert_array_equal(out.gain[moving], ahead.gain[moving])
-    common = np.exp(np.log(gain[moving]).mean(0))
-    np.testing.assert_allclose(out.gain[3], gain[3] / common, rtol=0.015)
 
 
 def test_views_without_overlap_keep_one():

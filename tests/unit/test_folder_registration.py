@@ -70,6 +70,14 @@ def test_a_view_that_sees_nothing_stays_as_it_is(found):
     assert out.frames[-1] is frames[-1] and out.poses[-1] is poses[-1] and "011" not in out.facts["views"]
 
 
+def test_a_held_out_photograph_is_neither_judged_nor_left_out():
+    photos = [replace(p, held=k == 2) for k, p in enumerate(room(12))]
+    photos[2] = replace(photos[2], image=np.random.default_rng(0).random(photos[2].image.shape))
+    frames, poses = _frames([p.pose for p in photos], 1.0), [p.pose for p in photos]
+    out = register_frames(frames, poses, photos, "opengl", 1.0)
+    assert not out.left_out and "002" not in out.facts["views"] and "001" in out.facts["views"]
+
+
 def test_one_photograph_has_nothing_to_be_registered_with():
     photo = room(1)
     frames = _frames([photo[0].pose], 1.0)

@@ -1,5 +1,6 @@
 """Input files in fingerprints: content decides, and a file that nobody touched is not read again."""
 
+import json
 import os
 import subprocess
 import sys
@@ -7,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.unit import own_scene as own
 from workflow.artifacts import files as io
-from workflow.artifacts.stamps import unsaved
-from workflow.runtime import input_digests
+from workflow.artifacts.stamps import stamp_of, unsaved
+from workflow.runtime import fingerprint, input_digests
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -135,6 +137,45 @@ def test_a_file_that_is_replaced_while_it_is_read_is_read_again(here, monkeypatc
         input_digests.digests([path])
     forget()
     assert input_digests.digests([path]) == [f"{path}:{whole(path)}"] and path.read_bytes() == EDITED + b"more"
+
+
+def test_a_changed_mesh_is_found_although_its_time_stamp_and_the_kept_digests_say_nothing(tmp_path):
+    """Two disguises: the kept digests are gone, or hold the old digest under the stamp that the file has now."""
+    path = own.project(tmp_path, {"registration": "off"}, {"width": 32, "height": 24})
+    own.photographed(path, 3)
+    own.run(tmp_path, "capture")
+    mesh = path / "mesh.ply"
+    with own.working_in(tmp_path):
+        manifest = json.loads(Path("results/own/capture/manifest.json").read_text())
+        assert manifest["raw"] == {name: io.sha256_of(Path(name)) for name in manifest["raw"]}
+        named = {Path(name).name for name in manifest["raw"]}
+        assert named == {"transforms.json", "mesh.ply", "000.png", "001.png", "002.png"}
+        assert list(input_digests.changed(["own"], REPOSITORY)) == []
+        before, old = mesh.stat(), io.sha256_of(mesh)
+        vertex = mesh.read_bytes().index(b"5.0 ")
+        data = mesh.read_bytes()
+        mesh.write_bytes(data[:vertex] + b"5.1 " + data[vertex + 4 :])
+        os.utime(mesh, ns=(before.st_atime_ns, before.st_mtime_ns))
+        assert mesh.stat().st_size == before.st_size
+        for disguise in ("gone", "stale"):
+            forget()
+            input_digests.CACHE.unlink(missing_ok=True)
+            if disguise == "stale":
+                kept = input_digests._kept(input_digests.CACHE.absolute())
+                kept.note("data/own/mesh.ply", stamp_of("data/own/mesh.ply"), old)
+                kept.save(flushed=True)
+            fingerprint.fingerprint.cache_clear()
+            assert (fingerprint.fingerprint("capture", "own", "draft") == manifest["fingerprint"]) == (disguise == "stale")
+            (line,) = input_digests.changed(["own"], REPOSITORY)
+            assert "mesh.ply" in line and "--forcerun capture" in line
+            fingerprint.fingerprint.cache_clear()
+            assert "capture" in fingerprint.missing_stages("own", "draft")
+        done = subprocess.run(
+            [sys.executable, "-m", "workflow", "verify"], env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, capture_output=True
+        )
+        assert done.returncode == 1 and b"mesh.ply" in done.stdout
+        mesh.unlink()
+        assert list(input_digests.changed(["own"], REPOSITORY)) == []
 
 
 ADDS = """

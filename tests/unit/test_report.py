@@ -315,7 +315,7 @@ def test_rerendering_matches_the_photographs(toy):
 
 def test_variants_and_gain(toy):
     table = read_parquet(toy / "results/toy/metrics/variants.parquet")
-    assert set(table["variant"]) == {"prior_k0", "prior_mean_k", "object_mean", "texel_mean", "base", "result"}
+    assert set(table["variant"]) == {"prior_k0", "prior_mean_k", "object_mean", "texel_mean", "photo_as_albedo", "base", "result"}
     summary = json.loads((toy / "results/toy/metrics/summary.json").read_text())
     means = summary["means"]
     assert means["base"]["albedo"]["scaled"]["psnr"]["mean"] > 60 > means["base"]["albedo"]["raw"]["psnr"]["mean"]

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.errors import refused
 from tests.unit import own_scene as own
-from workflow.sources.folder_scene.held_out import TWIN_PIXELS, hold_out
+from workflow.sources.folder_scene.held_out import TWIN_PIXELS, asked, hold_out
 
 
 def pose(at=(0.0, 0.0, 0.0), degrees=0.0):
@@ -82,6 +82,68 @@ def test_what_was_asked_for_stays_held_out_and_no_twin_is_used(split, seed):
     assert all(now == "test" for now, asked in zip(found.split, split, strict=True) if asked == "test")
     used = {digests[i] for i, one in enumerate(found.split) if one == "train"}
     assert not used & {digests[i] for i, one in enumerate(split) if one == "test"}
+
+
+def walk(count, step):
+    """A camera that walks along a line and looks to its side, 2 m from the surface."""
+    return [pose((step * i, 0, 0)) for i in range(count)], np.ones(count), np.full(count, 2.0)
+
+
+def runs(split):
+    """Lengths of the stretches that are held out."""
+    return [len(run) for run in "".join("x" if one == "test" else " " for one in split).split()]
+
+
+@pytest.mark.parametrize(
+    ("step", "lengths"),
+    [
+        (0.3, [1] * 25),  # .15 of the picture, and 1 / 8 is held out
+        (0.1, [13, 12]),  # .05: stretches of 4 / (8 * .05) = 10
+        (0.01, [25]),  # 100 would be more than there are
+        (0.0, [25]),
+    ],
+)
+def test_a_video_loses_stretches_and_the_same_share(step, lengths):
+    found = asked(*walk(200, step), every=8)
+    assert runs(found.split) == lengths and found.split.count("test") == 25 and len(found.split) == 200
+    assert found.blocks == (len(lengths) if step < 0.25 else 0)
+    np.testing.assert_allclose(found.step, step / 2)
+
+
+def test_half_of_a_stretch_is_as_far_from_what_is_used_as_the_share_asks():
+    poses, focal, depth = walk(1000, 0.02)
+    found = asked(poses, focal, depth, every=8)
+    held = hold_out(found.split, [str(i) for i in range(1000)], poses, 100 * focal, depth)
+    assert np.median(held.distance) / 2 >= 0.9 / 8 and len(runs(found.split)) == 2
+    alone = ["test" if i % 8 == 7 else "train" for i in range(1000)]
+    assert np.median(hold_out(alone, [str(i) for i in range(1000)], poses, 100 * focal, depth).distance) < 0.05
+
+
+@given(st.integers(2, 60), st.integers(2, 12), st.floats(0, 2))
+def test_the_share_is_kept_whatever_the_capture(count, every, step):
+    found = asked(*walk(count, step), every=every)
+    assert len(found.split) == count and found.split.count("test") == count // every
+
+
+def test_what_is_held_out_is_in_the_plan(tmp_path):
+    path = own.project(tmp_path, {"alignment": "off", "registration": "off"}, {"test_every": 3})
+    document, _ = own.photographed(path, 6)
+    found = {item["component"]: item for item in own.run(tmp_path, "capture").facts["plan"]}["held_out_stretches"]
+    assert not found["included"] and found["value"] > found["threshold"] == pytest.approx(1 / 3)
+    for number, frame in enumerate(document["frames"]):  # nearly one place, in steps of some pixels
+        frame["transform_matrix"] = (
+            np.array(document["frames"][0]["transform_matrix"]) + 0.05 * number * np.eye(4, k=3)
+        ).tolist()
+    own.write_transforms(path, document)
+    capture = own.run(tmp_path, "capture")
+    found = {item["component"]: item for item in capture.facts["plan"]}["held_out_stretches"]
+    assert found["included"] and found["value"] < found["threshold"]
+    assert runs([view.split for view in capture.views]) == [2]
+    document["test_filenames"] = [document["frames"][4]["file_path"]]
+    own.write_transforms(path, document)
+    capture = own.run(tmp_path, "capture")
+    found = {item["component"]: item for item in capture.facts["plan"]}["held_out_stretches"]
+    assert [view.name for view in capture.views if view.split == "test"] == ["004"] and found["status"] == "forced"
 
 
 def test_a_copied_photograph_cannot_raise_the_held_out_score(tmp_path):

@@ -194,6 +194,9 @@ class StageReader:
     """Reads a finished stage. Every file is checked against the manifest when it is opened; its content is hashed once in a
     process, as long as nobody touches it. `digest` is the SHA-256 of the manifest.
 
+    Attributes:
+        closed: what this job may not read: beginnings of names of files, which raise AssertionError, and `file:column`.
+
     Raises:
         DamagedArtefact: the manifest is missing or of another schema, a file is missing or has another hash, or a value is not
             finite.
@@ -201,6 +204,7 @@ class StageReader:
 
     def __init__(self, directory: Path, stage: str, scene: str):
         self.directory, self.stage, self.scene = directory, stage, scene
+        self.closed: tuple[str, ...] = ()
         path = directory / MANIFEST
         if not path.is_file():
             raise DamagedArtefact(path, stage, scene, "missing, so this stage is not finished", unfinished=True)
@@ -230,6 +234,8 @@ class StageReader:
 
     def path(self, name: str) -> Path:
         """Return the path of a file after checking it, for readers of other formats."""
+        if self.closed and name.startswith(self.closed):
+            raise AssertionError(f"{name} of stage {self.stage} is for scores alone: this job may not read it")
         facts = self.manifest["files"].get(name)
         path = io.inside(self.directory, name)
         if facts is None:
@@ -256,8 +262,11 @@ class StageReader:
         return channels
 
     def table(self, name: str, columns: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """Return the columns of a table as numpy arrays; fixed-size lists are (n, k). Of `columns`, those there; None = all."""
+        """Return the columns of a table as numpy arrays; fixed-size lists are (n, k). Of `columns`, those there; None = all.
+        Closed ones are left out."""
         path = self.path(name)
+        if shut := {own.removeprefix(f"{name}:") for own in self.closed if own.startswith(f"{name}:")}:
+            columns = [own for own in columns or self.manifest["files"][name]["channels"] if own not in shut]
         try:
             return io.read_parquet(path, columns)
         except Exception as error:

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from iif_core.camera.gains import SIGNIFICANT, Evidence
-from workflow.decisions.record import Decision, decision
+from workflow.decisions.record import FORCED, Decision, decision, not_probed
 
 EXPOSURE_LOG_RATIO = 0.05
 """Median |log gain| between overlapping views, above which gains are estimated."""
+MOTION = "median motion between neighbouring photographs, share of the picture's width"
 RESPONSE_ERRORS = 2.0
 """Standard errors by which a larger family of responses must be better."""
 
@@ -38,6 +39,24 @@ def registration(accepted: bool, gain: float, error: float, moved: float, left_o
     by = "the texture" if gain > SIGNIFICANT * error else "the fit of edges of the mesh"
     reason = f"{done}{f', as {by} supports' if accepted else ''}; {left_out} of {views} left out as blurred or badly posed"
     return decision("registration", accepted, measure, value, SIGNIFICANT, reason)
+
+
+def held_out(step: float, every: int, blocks: int, nearest: str) -> Decision:
+    """Decide whether whole stretches of a video are held out.
+
+    Args:
+        step: median motion between neighbouring photographs, as a share of the width of the picture.
+        every: one of so many photographs is held out; blocks: stretches, 0 = single photographs.
+        nearest: how far held-out photographs are from the nearest used one.
+    """
+    how = f"a video: {blocks} stretch(es) are held out whole" if blocks else f"no video: one photograph of {every} is held out"
+    reason = f"{how}; held-out photographs are {nearest}"
+    return decision("held_out_stretches", blocks > 0, MOTION, step, 1 / every, reason)
+
+
+def held_out_by_lists(nearest: str) -> Decision:
+    """Describe photographs that lists of the source hold out."""
+    return not_probed("held_out_stretches", False, f"lists of the source hold out; those photographs are {nearest}", FORCED)
 
 
 def camera_response(dynamic_range: str, calibration: dict[str, Any]) -> Decision:

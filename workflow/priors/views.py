@@ -48,8 +48,8 @@ class CaptureViews:
         self.views = capture.used
         self.vertices, self.faces = capture.mesh()
         self.face_normals, _ = face_geometry(self.vertices, self.faces)
-        given = capture.faces()["instance_id"].astype(np.int64)
-        by_face = objects_given and bool((given >= 0).any())
+        given = capture.faces()["instance_id"].astype(np.int64) if objects_given else np.zeros(0, np.int64)
+        by_face = bool((given >= 0).any())
         self.decoded, self._kept = DecodedViews(capture, memory_mb=MEMORY_MB), Kept(MEMORY_MB)
         self.face_group = given if by_face else pieces(Surface(capture, decoded=self.decoded), PIECES).astype(np.int64)
         self.number = {view.view_id: i for i, view in enumerate(self.views)}

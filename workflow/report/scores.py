@@ -17,6 +17,9 @@ VARIANT_NAMES = {
     "prior_mean_k": "raw predictions (mean score)",
     "object_mean": "mean per object",
     "texel_mean": "mean per surface cell",
+    "photo_mean": "mean of the other photographs",
+    "photo_nearest": "blend of the nearest photographs",
+    "photo_as_albedo": "mean photograph as albedo",
     "base": "base texture (fused)",
     "result": "result",
 }
@@ -62,6 +65,10 @@ def headline(summary: Mapping[str, Any], has_lamps: bool, has_truth: bool) -> st
     text = f"Re-renderings reach {psnr['mean']:.1f} dB PSNR on the photographs (sensor values)." if psnr else ""
     if held_out:
         text += f" On the {held_out['views']} held-out photographs: {held_out['mean']:.1f} dB."
+        mean, blend = (found(means, "rgb_held_out", "raw", "psnr", variant) for variant in ("photo_mean", "photo_nearest"))
+        if mean and blend:
+            text += f" The mean of the other photographs, with no model of light, reaches {mean['mean']:.1f} dB,"
+            text += f" and a blend of the nearest ones {blend['mean']:.1f} dB."
     gain = summary.get("gain_over_raw_predictions", {}).get("albedo", {}).get("scaled", {}).get("psnr_db")
     if gain is not None:
         raw, own, plain = (
@@ -70,7 +77,9 @@ def headline(summary: Mapping[str, Any], has_lamps: bool, has_truth: bool) -> st
         uncorrected = f"{raw['mean']:.1f} dB as it is and " if raw else ""
         text += f" Against ground truth, albedo reaches {uncorrected}{own['mean']:.1f} dB up to scale,"
         text += f" {gain:.1f} dB above predictions"
-        text += f"; one flat colour per object, the mean of its predictions, reaches {plain['mean']:.1f} dB." if plain else "."
+        text += f"; one flat colour per object, the mean of its predictions, reaches {plain['mean']:.1f} dB" if plain else ""
+        taken = found(means, "albedo", "scaled", "psnr", "photo_as_albedo")
+        text += f"; the mean photograph, taken for albedo, {taken['mean']:.1f} dB." if taken else "."
     if not has_lamps:
         text += " No lamp was found, so relighting has none to switch off."
     if gain is None and not has_truth:

@@ -145,8 +145,8 @@ def stage_modules(stage: str, settings: dict[str, Any]) -> list[str]:
 
 
 def _roots(stage: str, settings: dict[str, Any]) -> tuple[str, ...]:
-    kinds = _kinds(settings[CHOOSES[stage]]) if stage in CHOOSES else []
-    return module_of(stage, settings), *(plugins.implementation(CHOOSES[stage], kind) for kind in kinds)
+    chosen = kinds(settings[CHOOSES[stage]]) if stage in CHOOSES else []
+    return module_of(stage, settings), *(plugins.implementation(CHOOSES[stage], kind) for kind in chosen)
 
 
 def module_of(stage: str, settings: dict[str, Any]) -> str:
@@ -160,7 +160,7 @@ def settings_of(stage: str, settings: dict[str, Any]) -> tuple[str, ...]:
     return (*STAGES[stage].settings, *(key for key in more if key not in STAGES[stage].settings))
 
 
-def _kinds(section: dict[str, Any]) -> list[str]:
+def kinds(section: dict[str, Any]) -> list[str]:
     """Return what a section chooses, and what its members choose where it has any (`prior: {kind: pooled}`)."""
     return [section["kind"], *(member["kind"] for member in section.get("of", ()))]
 
@@ -180,6 +180,16 @@ def modules_digest(modules: list[str]) -> str:
 def raw_digest(paths: list[Path]) -> str:
     """Return the digest of the contents of input files."""
     return hashlib.sha256("\n".join(input_digests.digests(paths, _name_of)).encode()).hexdigest()[:16]
+
+
+def raw_contents(stage: str, document: dict[str, Any]) -> dict[str, str]:
+    """Return name -> SHA-256 of the files from outside that a stage reads.
+
+    Raises:
+        InputError: as `raw_inputs`.
+    """
+    paths = raw_inputs(stage, document) if STAGES[stage].reads_raw else []
+    return {name: digest for name, _, digest in (line.rpartition(":") for line in input_digests.digests(paths, _name_of))}
 
 
 def _name_of(path: Path) -> str:

@@ -12,7 +12,11 @@ from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 
-from workflow.artifacts.stamps import Stamps, unsaved
+from workflow.artifacts import files as io
+from workflow.artifacts import manifest as manifests
+from workflow.artifacts.manifest import MANIFEST
+from workflow.artifacts.stamps import Stamps, stamp_of, unsaved
+from workflow.artifacts.store import command
 
 CACHE = Path("results/.input-digests.json")
 
@@ -31,6 +35,36 @@ def digests(paths: Iterable[Path], named: Callable[[Path], str] = str) -> list[s
     out = [f"{named(path)}:{kept.of(path)}" for path in paths]
     kept.save(flushed=True)
     return out
+
+
+def changed(scenes: Iterable[str], home: Path) -> Iterator[str]:
+    """Yield one line for each input file whose content is not the one that the manifest of a stage names.
+
+    Every content is hashed, whatever time stamps say, and what is found takes the place of what was kept, so that the next plan
+    makes the stage again. A file that is gone is not compared: results outlive their inputs, and the next plan asks for it.
+
+    Args:
+        scenes: whose stages in results/ are compared.
+        home: the checkout, from which the names of files of the program count.
+    """
+    kept, found = _kept(CACHE.absolute()), {}
+    for scene in scenes:
+        for path in sorted(Path("results", scene).glob(f"*/{MANIFEST}")):
+            try:
+                document = manifests.read(path)
+            except manifests.Broken:  # of which `damaged` tells
+                continue
+            for name, digest in document.get("raw", {}).items():
+                file = next((place for place in (Path(name), home / name) if place.is_file()), None)
+                if file is None:
+                    continue
+                if file not in found:
+                    stamp, found[file] = stamp_of(file), io.sha256_of(file)
+                    kept.note(file, stamp, found[file])
+                if found[file] != digest:
+                    again = command(scene, document["stage"], document.get("quality"))
+                    yield f"{file}: another content than {path.parent} was made from; rebuild with: {again}"
+    kept.save(flushed=True)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from types import SimpleNamespace
 from typing import IO, Any, NamedTuple
 
 from iif_core.errors import InputError
+from workflow import plugins
 from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter, links, stamps
 from workflow.artifacts.files import facts_in, write_json
@@ -27,6 +28,9 @@ from workflow.runtime import device, forecast
 from workflow.runtime import fingerprint as fp
 from workflow.settings import derived
 
+CLOSED_TRUTH = ("truth/", *(f"faces.parquet:emission_{c}" for c in "rgb"))
+CLOSED_IDS = ("given/", "instances.parquet", "faces.parquet:instance_id")
+"""Ground truth, and ids of objects, in a capture."""
 _LIBRARIES = ("numpy", "scipy", "mitsuba", "drjit", "open3d", "OpenEXR", "pyarrow", "torch", "snakemake")
 
 
@@ -54,6 +58,10 @@ class Planned:
     def fingerprint(self, stage: str, scene: str, quality: str) -> str:
         """Return what a stage is made as."""
         return fp.fingerprint(stage, scene, quality)
+
+    def raw(self, stage: str, document: dict[str, Any]) -> dict[str, str]:
+        """Return name -> SHA-256 of the files from outside that a stage reads."""
+        return fp.raw_contents(stage, document)
 
     def directory(self, stage: str, scene: str) -> Path:
         """Return the folder that a stage writes."""
@@ -156,8 +164,20 @@ class Job:
 
     def _reader(self, stage: str, of: str) -> StageReader:
         if (stage, of) not in self._readers:
-            self._readers[stage, of] = self._scenes.reader(stage, of, self.quality)
+            reader = self._scenes.reader(stage, of, self.quality)
+            if stage == "capture" and not self.stage.scores:
+                reader.closed = self._closed(reader)
+            self._readers[stage, of] = reader
         return self._readers[stage, of]
+
+    def _closed(self, capture: StageReader) -> tuple[str, ...]:
+        """Return what of a capture is for scores alone: held-out photographs; ground truth, and the ids of objects, unless the
+        settings ask for them."""
+        cameras = capture.table("cameras.parquet", ("name", "split"))
+        held = [f"photos/{name}.exr" for name, split in zip(cameras["name"], cameras["split"], strict=True) if split == "test"]
+        truth = [] if plugins.made_of_truth() & set(fp.kinds(self.document["prior"])) else CLOSED_TRUTH
+        ids = CLOSED_IDS if truth and self.document["segmentation"]["kind"] != "given" else ()
+        return (*held, *truth, *ids)
 
     @cached_property
     def writer(self) -> StageWriter:
@@ -184,6 +204,7 @@ class Job:
             "code": fp.code_digest(self.stage.name, self.document),
             "seed": self.document["seed"],
             "inputs": inputs,
+            "raw": self._scenes.raw(self.stage.name, self.document),
             "device": self.device.facts(),
             "versions": library_versions(),
         }

@@ -141,6 +141,8 @@ class CaptureReader:
     def __init__(self, reader: StageReader):
         self.reader = reader
         self.facts: dict[str, Any] = reader.json("capture.json")
+        if "truth/" in reader.closed:
+            self.facts = {key: value for key, value in self.facts.items() if not key.endswith("_truth")}
         table = reader.table("cameras.parquet")
         self.views = [
             View(
@@ -178,11 +180,11 @@ class CaptureReader:
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Return vertices (n, 3) float32 in metres and faces (m, 3) int32."""
-        v, f = self.reader.table("vertices.parquet"), self.reader.table("faces.parquet")
+        v, f = self.reader.table("vertices.parquet"), self.reader.table("faces.parquet", ("v0", "v1", "v2"))
         return np.stack([v["x"], v["y"], v["z"]], 1), np.stack([f["v0"], f["v1"], f["v2"]], 1)
 
     def faces(self) -> dict[str, np.ndarray]:
-        """Return the columns of faces.parquet, among them instance ids and true emission."""
+        """Return the columns of faces.parquet, with instance ids and true emission only for jobs that may read them."""
         return self.reader.table("faces.parquet")
 
     @property
@@ -194,7 +196,7 @@ class CaptureReader:
         """Return (H, W, 3) float32 sensor values or radiance, and (H, W) bool, the pixels that may be used.
 
         Raises:
-            AssertionError: the view is held out and `held_out` is not set; only scoring and display may set it.
+            AssertionError: the view is held out, and `held_out` is not set, or the stage is not one that `scores` (registry.py).
         """
         if view.split == "test" and not held_out:
             raise AssertionError(f"view {view.name} is held out: its photograph is for scores alone")

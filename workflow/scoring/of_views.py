@@ -15,6 +15,7 @@ from workflow.artifacts.store import StageReader, ids_from_disk, material_maps, 
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_base
 from workflow.scene.normal_form import CaptureReader, View
+from workflow.scoring.rivals import OtherPhotographs
 from workflow.scoring.scores import MaterialTruth, ScoreRows, material_truth
 
 BASELINES = {
@@ -22,6 +23,9 @@ BASELINES = {
     "prior_mean_k": "mean L2 and PSNR of all predictions of each view (not those of their mean)",
     "object_mean": "one value an object: mean of all predictions of all scored views",
     "texel_mean": "one value a surface cell: mean of all predictions of all scored views",
+    "photo_mean": "a held-out photograph by the mean of the photographs that were used, without any model of light",
+    "photo_nearest": "the same by a blend of the photographs from nearest by",
+    "photo_as_albedo": "the mean radiance of each surface cell, at the level of the base, taken for its albedo",
     "base": "the fused base texture, before the fit to the photographs",
     "result": "what is published",
 }
@@ -39,6 +43,7 @@ def scores_of_view(
     view: View,
     exposure: float,
     means: PredictionMeans | None,
+    others: OtherPhotographs,
     networks: Mapping[str, Mapping[str, Weights]],
 ) -> Iterator[tuple[str, str, str, list[metrics.Score]]]:
     """Yield (variant, view, quantity, scores) of one view."""
@@ -49,12 +54,11 @@ def scores_of_view(
     file = f"maps/{view.name}.exr"
     rendered = job.read("render").exr(file)
     sensor = np.clip(exposure * photo, 0, 1) if capture.is_hdr else photo
-    yield (
-        "result",
-        view.name,
-        rgb_of,
-        metrics.score_map("rgb", rgb(rendered, "ldr"), sensor, valid & hit, encoded=not capture.is_hdr, networks=networks["rgb"]),
-    )
+    target = metrics.Target("rgb", sensor, valid & hit, encoded=not capture.is_hdr, networks=networks["rgb"])
+    yield "result", view.name, rgb_of, target.scores(rgb(rendered, "ldr"))
+    if view.split == "test":
+        for variant, picture in others.predictions(view, photo, valid & hit):
+            yield variant, view.name, rgb_of, target.scores(picture)
     if capture.is_hdr:
         yield "result", view.name, rgb_of, _log_scores(rgb(rendered), photo, valid & hit)
     if means is None:
@@ -76,6 +80,9 @@ def scores_of_view(
             cell_id = ids_from_disk(channels["cell.id"]) if variant == "base" else cell_id
             for quantity in PROPERTIES:
                 yield variant, view.name, quantity, _scores(materials, variant, material_maps(channels), quantity)
+    if cell_id is not None and others.albedo is not None:
+        maps = {"albedo": others.albedo[cell_id]}
+        yield "photo_as_albedo", view.name, "albedo", _scores(materials, "photo_as_albedo", maps, "albedo")
     if not job.read("prior").has(file):
         return
     channels = job.read("prior").exr(file)

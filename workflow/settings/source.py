@@ -115,7 +115,8 @@ class Capture(Section):
     exposure: Literal["given", "estimate"] = "given"
     """`estimate`: find the exposures of the photographs from surface that several of them show."""
     test_every: int = Field(0, ge=0)
-    """Hold out every n-th view: no stage before `render` and `metrics` reads its photograph (0 = none)."""
+    """Hold out every n-th view, or as many in stretches of a video: no stage before `render` and `metrics` reads its photograph
+    (0 = none)."""
 
     @field_validator("test_every")
     @classmethod

@@ -16,6 +16,8 @@ import numpy as np
 
 from iif_core.camera.registration import Photo
 from iif_core.errors import InputError
+from workflow.decisions import camera as camera_decisions
+from workflow.decisions.record import Decision
 from workflow.intake.documents import reading
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureWriter, View
@@ -67,7 +69,7 @@ def capture_photographs(job: Job, inputs: Inputs) -> None:
     exposures, words = exposure.given(inputs.exposures, frames, settings.exposure)
     said += words
     task = _Task(inputs, source, settings, conventions, Room.of(surface, job.threads))
-    held = _held_out(task, poses)
+    held, decision = _held_out(task, poses)
     task, names = replace(task, splits=held.split), [frame.name for frame in frames]
     said += held.notes(names)
     posed, forms = _registered(job, task, poses, exposures)
@@ -78,7 +80,8 @@ def capture_photographs(job: Job, inputs: Inputs) -> None:
     if not taken.views:
         raise InputError(_sees_nothing(task, taken))
     said += notes.of_dropped(taken.dropped, len(frames))
-    said += notes.of_blank(inputs.transforms.path, taken.blank, len(taken.views))
+    used = sum(view.split != "test" for view in taken.views)
+    said += notes.of_blank(inputs.transforms.path, taken.blank, used)
     said += _checked_alignment(task, taken)
     views = taken.views
     if settings.exposure == "estimate":
@@ -87,7 +90,7 @@ def capture_photographs(job: Job, inputs: Inputs) -> None:
     said += notes.of_pixels(posed.frames, taken.counts, [*forms, *taken.forms])
     said += notes.of_views(posed.frames, views, task.listed, settings.test_every, task.encoded)
     said += notes.of_objects(posed.frames, surface, inputs.mesh.name)
-    _write(job, task, posed, taken, views, surface, said, held.facts(names))
+    _write(job, task, posed, taken, views, surface, said, held.facts(names), decision)
 
 
 @dataclass(frozen=True)
@@ -115,13 +118,6 @@ class _Task:
         """Return the names of at most `count` frames, evenly spread."""
         frames = self.inputs.transforms.frames
         return {frames[i].name for i in transforms.evenly_spread(len(frames), count)}
-
-    def asked(self, frame: Frame, number: int) -> str:
-        """Return `train` or `test`, as asked; lists of the data set take precedence over `capture.test_every`."""
-        if self.listed:
-            return frame.split or "train"
-        every = self.settings.test_every
-        return "test" if every and number % every == every - 1 else "train"
 
     def view(self, frame: Frame, pose: np.ndarray, number: int, gain: float, longest: float = np.inf) -> View:
         """Return the camera of a frame in the size of the capture, or `longest` if that is less."""
@@ -166,32 +162,37 @@ def _mesh(inputs: Inputs, source: Any, poses: Sequence[np.ndarray]) -> mesh.Mesh
     return found
 
 
-def _held_out(task: _Task, poses: Sequence[np.ndarray]) -> held_out.HeldOut:
-    """Hold out what is asked for, and what repeats it.
+def _held_out(task: _Task, poses: Sequence[np.ndarray]) -> tuple[held_out.HeldOut, list[Decision]]:
+    """Hold out what is asked for, and what repeats it; lists of the data set take precedence over `capture.test_every`.
 
     Raises:
         InputError: that leaves no photograph to use.
     """
-    frames = task.inputs.transforms.frames
-    split = [task.asked(frame, i) for i, frame in enumerate(frames)]
-    if "test" not in split:
-        return held_out.HeldOut(split, {}, np.zeros(0), np.zeros(0))
-    digests, focal, depths = [], np.zeros(len(frames)), np.full(len(frames), np.nan)
+    frames, every = task.inputs.transforms.frames, task.settings.test_every
+    listed = [frame.split or "train" for frame in frames]
+    if "test" not in listed and (task.listed or not every):
+        return held_out.HeldOut(listed, {}, np.zeros(0), np.zeros(0)), []
+    digests, focal, widths, depths = [], np.zeros(len(frames)), np.ones(len(frames)), np.full(len(frames), np.nan)
     for i, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
         with reading(frame.image, "not a readable image"), frame.image.open("rb") as file:
             digests.append(hashlib.file_digest(file, "sha256").hexdigest())
-        focal[i] = task.view(frame, pose, i, 1.0).fx
-        if split[i] == "test":
-            depth, face = task.room.seen(task.view(frame, pose, i, 1.0, held_out.DEPTH_WIDTH))
-            depths[i] = np.median(depth[face >= 0]) if (face >= 0).any() else np.nan
-    found = held_out.hold_out(split, digests, poses, focal, depths)
+        view = task.view(frame, pose, i, 1.0)
+        focal[i], widths[i] = view.fx, view.width
+        depth, face = task.room.seen(task.view(frame, pose, i, 1.0, held_out.DEPTH_WIDTH))
+        depths[i] = np.median(depth[face >= 0]) if (face >= 0).any() else np.nan
+    asked = None if task.listed else held_out.asked(poses, focal / widths, depths, every)
+    found = held_out.hold_out(asked.split if asked else listed, digests, poses, focal, depths)
     if "train" not in found.split:
         fewer = "hold out fewer in its lists" if task.listed else "set `capture.test_every: 0`"
         raise InputError(
             f"{task.inputs.transforms.path}: every photograph that is not held out repeats a held-out one (the same file, or the"
             f" same place to a pixel), so none is left to use: remove repeated photographs, or {fewer}"
         )
-    return found
+    if not len(found.distance):  # fewer photographs than `capture.test_every`
+        return found, []
+    if asked is None:
+        return found, [camera_decisions.held_out_by_lists(found.nearest)]
+    return found, [camera_decisions.held_out(asked.step, every, asked.blocks, found.nearest)]
 
 
 def _registered(
@@ -211,9 +212,9 @@ def _registered(
         if (face >= 0).mean() < MIN_COVERAGE:
             continue
         one = photograph(frame, view, task.encoded, gains[i])
-        forms += [(one.form, frame.name)] * bool(one.form)
-        camera = (view.fx, view.fy), (view.cx, view.cy), pose
         held = task.splits[i] == "test"
+        forms += [(one.form, frame.name)] * bool(one.form and not held)
+        camera = (view.fx, view.fy), (view.cx, view.cy), pose
         photos[-1] = Photo(one.pixels, one.valid, depth, task.room.normals_of(face), *camera, held)
         job.progress(i + 1, len(frames), "photographs registered")
     return registration.register_frames(frames, poses, photos, task.conventions.axes, task.inputs.metres), forms
@@ -235,26 +236,28 @@ def _take(job: Job, task: _Task, posed: registration.Registered, gains: list[flo
             out.blind.append((frame, view))
             continue
         one = photograph(frame, view, task.encoded, gains[i])
+        seen = one.without_black(task.encoded)
+        writer.gbuffer(view.name, depth, face)
+        _write_photograph(task, writer, frame, view, seen, face)
+        out.views.append(view)
+        out.frames.append(frame)
+        job.progress(i + 1, len(frames), "photographs")
+        if view.split == "test":  # a held-out photograph is copied, and nothing is found out about it
+            continue
         out.counts.update(one.counts)
         out.forms += [(one.form, frame.name)] * bool(one.form)
         if not one.valid.any():
             out.notes.append(f"view {view.name}: no usable pixel (all transparent, masked or NaN)")
         if blank := one.blank(task.encoded):
             out.blank[blank].append(view.name)
-        one = one.without_black(task.encoded)
-        writer.gbuffer(view.name, depth, face)
-        _write_photograph(task, writer, frame, view, one, face)
         if task.source.alignment != "off":
             out.aligned.add_depth(frame, task.conventions, pinhole(view), depth, task.inputs.transforms.depth_unit)
-            edges = alignment.edge_pictures(one.pixels, one.valid, depth, task.room.normals_of(face))
+            edges = alignment.edge_pictures(seen.pixels, seen.valid, depth, task.room.normals_of(face))
             out.aligned.add_edges(frame.name, *edges, frame.name in compared)
-            out.trials += [_trial(frame, view, one)] * (frame.name in tried)
-        if task.settings.exposure == "estimate" and view.split != "test":
+            out.trials += [_trial(frame, view, seen)] * (frame.name in tried)
+        if task.settings.exposure == "estimate":
             points = view.world_from_camera[:3, 3] + depth[..., None] * view.directions()
-            shared.add(one.pixels, one.valid & (face >= 0), points, float(np.median(depth[face >= 0])) / view.fx)
-        out.views.append(view)
-        out.frames.append(frame)
-        job.progress(i + 1, len(frames), "photographs")
+            shared.add(seen.pixels, seen.valid & (face >= 0), points, float(np.median(depth[face >= 0])) / view.fx)
     return out
 
 
@@ -297,6 +300,7 @@ def _write(
     surface: mesh.Mesh,
     said: list[str],
     held: dict[str, object],
+    decided: list[Decision],
 ) -> None:
     writer = CaptureWriter(job.writer)
     writer.cameras(views)
@@ -306,7 +310,7 @@ def _write(
         "dropped_views": taken.dropped,
         "left_out_views": posed.left_out,
         "registration": posed.facts,
-        "plan": posed.plan,
+        "plan": [*posed.plan, *decided],
         "exposure_estimated": task.settings.exposure == "estimate",
         **({"held_out": held} if held else {}),
     }
@@ -347,7 +351,7 @@ def _sees_nothing(task: _Task, taken: _Taken) -> str:
     tried = task.spread(alignment.TRIAL_VIEWS)
     better = _better_depth(task, taken.blind)
     if not better:
-        seen = [(f, v) for f, v in taken.blind if f.name in tried]
+        seen = [(f, v) for f, v in taken.blind if f.name in tried and v.split != "test"]
         better = _better_edges(task, [_trial(f, v, photograph(f, v, task.encoded, 1.0)) for f, v in seen], 0.0)
     listed = task.inputs.transforms
     return (

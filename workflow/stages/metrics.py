@@ -12,6 +12,7 @@ from workflow.scene.normal_form import CaptureReader, View
 from workflow.scoring.light_error import light_error
 from workflow.scoring.no_reference import EVERY_VIEW, truth_free_scores
 from workflow.scoring.of_views import PredictionMeans, scores_of_view, summary
+from workflow.scoring.rivals import OtherPhotographs
 from workflow.scoring.scores import (
     UNITS,
     ScoreRows,
@@ -31,11 +32,12 @@ def run(job: Job) -> None:
         rows.missing.append({"quantity": "albedo", "metric": "lpips_vgg", "reason": FETCH_VGG})
     views = scored_views(capture, job.settings.metrics.views)
     used = [view for view in views if view.split != "test"]
+    others = OtherPhotographs(job, capture)
     means = PredictionMeans(job, views) if capture.has_truth else None
     exposure_of = {view.view_id: float(e) for view, e in zip(capture.views, capture.exposures(), strict=True)}
 
     def scores_of(view: View) -> list[tuple[str, str, str, list[metrics.Score]]]:
-        return list(scores_of_view(job, capture, view, exposure_of[view.view_id], means, networks_of))
+        return list(scores_of_view(job, capture, view, exposure_of[view.view_id], means, others, networks_of))
 
     with ThreadPoolExecutor(job.threads) as pool:
         # `map` keeps the order of the views, so the tables do not depend on the number of threads.

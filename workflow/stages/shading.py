@@ -48,11 +48,10 @@ def run(job: Job) -> None:
     counts = np.zeros(max(scene.n_objects, 1), np.int64)  # of the pixels of each object that may enter the fit
 
     def seen() -> Iterator[tuple[int, ViewPixels]]:
-        for view in decoded.capture.views:
+        for view in decoded.capture.used:
             pixels = decoded.pixels(view, scene.normals)
             yield view.view_id, pixels
-            if view.split != "test":
-                counts[:] += count_eligible(pixels, mixed, scene.n_objects)
+            counts[:] += count_eligible(pixels, mixed, scene.n_objects)
 
     cells = cells_of_views(seen(), options.cell_edge, cache_origin(scene, options.cell_edge), options)
     drawn = None if own.pixels == "all" else PixelDraw.evenly(counts, int(own.pixels), mixed, job.seed)
@@ -68,15 +67,14 @@ def run(job: Job) -> None:
     job.log.info("%s", words_of_diffuse(cells, diffuse, own.noise))
     with job.timed("specular"):
         traced, lit = 0, world if specular["included"] else None
-        for done, view in enumerate(decoded.capture.views):
-            job.progress(done, len(decoded.capture.views), "views cached")
+        for done, view in enumerate(decoded.capture.used):
+            job.progress(done, len(decoded.capture.used), "views cached")
             pixels = decoded.pixels(view, scene.normals)
             places = np.arange(len(pixels.index)) if drawn is None else drawn.of(pixels, view)
-            places = places[:0] if view.split == "test" else places  # nothing is traced for held-out views
             found = light_of_pixels(lit, view.view_id, pixels, places, levels, cells, diffuse, options)
             write_light_of_view(job, view, pixels, found)
             traced += found.traced
-        job.progress(len(decoded.capture.views), len(decoded.capture.views), "views cached")
+        job.progress(len(decoded.capture.used), len(decoded.capture.used), "views cached")
     job.writer.table("levels.parquet", {"level": np.arange(len(levels), dtype=np.int32), "roughness": levels})
     facts = {"diffuse": facts_of_diffuse(cells, diffuse), "specular": {"pixels": traced}, "plan": [specular, indirect]}
     job.writer.json("shading.json", {**facts, "numerics": numerics.of_shading(diffuse, own.noise)})

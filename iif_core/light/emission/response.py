@@ -15,7 +15,7 @@ from iif_core.camera.calibration.choice import (
     given_response,
     needs_rows,
 )
-from iif_core.camera.gains import CameraGains, choose_gains, radius_squared, with_held_out_views
+from iif_core.camera.gains import CameraGains, choose_gains, radius_squared
 from iif_core.camera.overlap import PatchRows, join_rows, no_rows, patch_edge, patch_numbers, patch_rows
 from iif_core.camera.response import Response
 from iif_core.light.emission.photographs import STATISTICS_PIXELS, Photographs
@@ -27,7 +27,7 @@ def calibrated(
 ) -> tuple[Photographs, CalibratedResponse]:
     """Find the camera response and the gains that go with it.
 
-    Held-out views take part only with gains that follow from the others.
+    Held-out views take no part, and keep the gains that the source knows.
 
     Args:
         photos: whose sensor has no curve yet.
@@ -47,8 +47,7 @@ def calibrated(
     if measured:
         found = given_response(*measured, exposure)
     else:
-        moving = rows.take(np.isin(rows.view, number))
-        moving = replace(moving, view=np.searchsorted(number, moving.view).astype(np.int32))
+        moving = replace(rows, view=np.searchsorted(number, rows.view).astype(np.int32))
         found = calibrate_response(moving, exposure, families, photos.sensor.saturation, given=given)
     photos.log.say(f"camera response: {found.reason}")
     gains = _all_gains(photos.gains, number, found, rows) if estimated else photos.gains
@@ -56,22 +55,19 @@ def calibrated(
 
 
 def _all_gains(start: CameraGains, number: np.ndarray, found: CalibratedResponse, rows: PatchRows) -> CameraGains:
-    """Gains of all views of the capture: of the views `number` that were used, and of the others, which follow from them."""
-    moving = np.isin(np.arange(len(start.gain)), number)
-    linear = gain_rows(rows, found.response)
+    """Gains of all views of the capture: of the views `number` that were used as they were found, of the others as at the
+    start."""
     if found.gains is None:  # the curve is given, the gains are not
-        own = choose_gains(linear.take(moving[linear.view]).thinned(), len(start.gain))
-        ahead = replace(own, gain=np.where(own.estimated[:, None], own.gain, start.gain))
-    else:
-        gain, seen = start.gain.copy(), np.zeros(len(moving), bool)
-        gain[number], seen[number] = found.gains.gain, found.gains.estimated
-        ahead = replace(found.gains, gain=gain, estimated=seen)
-    return with_held_out_views(linear, ahead, moving)
+        own = choose_gains(gain_rows(rows, found.response).thinned(), len(start.gain))
+        return replace(own, gain=np.where(own.estimated[:, None], own.gain, start.gain))
+    gain, seen = start.gain.copy(), np.zeros(len(start.gain), bool)
+    gain[number], seen[number] = found.gains.gain, found.gains.estimated
+    return replace(found.gains, gain=gain, estimated=seen)
 
 
 def _shared_surface(photos: Photographs) -> PatchRows:
-    """Patches of interior surface as all views show them."""
-    scene, views = photos.scene, photos.every
+    """Patches of interior surface as the views show them."""
+    scene, views = photos.scene, photos.views
     medians = [(photos.records[view].median_depth, view.fx) for view in views]
     apart = photos.records.share**-0.5  # pixels that are looked at, in pixels
     footprints = [apart * depth / focal for depth, focal in medians if depth is not None]
@@ -81,12 +77,12 @@ def _shared_surface(photos: Photographs) -> PatchRows:
     share = min(1.0, STATISTICS_PIXELS / max(photos.records.share * sum(view.width * view.height for view in views), 1))
     saturation = photos.sensor.saturation
     parts = [no_rows()]
-    for number, view in enumerate(views):
+    for done, view in enumerate(views):
         pixels = photos.records[view].pixels
         pixels = pixels.take(np.flatnonzero(pixels.valid & pixels.interior))
         patch = patch_numbers(pixels.points, pixels.object_id, edge, origin)
         radius2 = radius_squared(pixels.index, view.width, view.height)
-        rows = (patch, pixels.normals, pixels.object_id, pixels.value, number)
+        rows = (patch, pixels.normals, pixels.object_id, pixels.value, photos.number(view))
         parts.append(patch_rows(*rows, saturation, share=share, radius2=radius2))
-        photos.log.progress(number + 1, len(views), "views compared for the camera response")
+        photos.log.progress(done + 1, len(views), "views compared for the camera response")
     return join_rows(parts)

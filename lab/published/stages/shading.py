@@ -45,19 +45,19 @@ def run(job: Job) -> None:
     device.mitsuba()
     geometry, material = scene.traceable()
     world = Scene(geometry, material, light.emitters(geometry), read_radiance_cache(job))
-    for done, view in enumerate(capture.views):
-        job.progress(done, len(capture.views), "views cached")
+    for done, view in enumerate(capture.used):
+        job.progress(done, len(capture.used), "views cached")
         if job.writer.part_kept(view.name) is None:
             _view(job, world, levels, view, DecodedViews(capture, job.read("segmentation"), 0).pixels(view, scene.normals))
         count += len(job.writer.columns(table_of(view))["index"])
     job.writer.table("levels.parquet", {"level": np.arange(LEVELS, dtype=np.int32), "roughness": levels})
     facts = {"cells": 0, "cell_edge_m": scene.cell_edge, "paths_per_pixel": DIFFUSE_PATHS}
     job.writer.json("shading.json", {"diffuse": facts, "specular": {"pixels": count}, "plan": []})
-    job.progress(len(capture.views), len(capture.views), "views cached")
+    job.progress(len(capture.used), len(capture.used), "views cached")
 
 
 def _view(job: Job, world: Scene, levels: np.ndarray, view: View, pixels: ViewPixels) -> None:
-    """Write the light of one view; held-out views have no specular light."""
+    """Write the light of one view."""
     from iif_core.light.transport.scene import PathOptions
     from lab.published.light.single_bounce import shade_lobe
 
@@ -69,19 +69,17 @@ def _view(job: Job, world: Scene, levels: np.ndarray, view: View, pixels: ViewPi
         return [_denoised(part, pixels.index, view) for part in found]
 
     diffuse = lobe(0, None, DIFFUSE_PATHS)[0]
-    own = slice(0, 0) if view.split == "test" else slice(None)
     s0, s1 = np.zeros((2, len(pixels.index), LEVELS, 3), np.float32)
-    if view.split != "test":
-        for j, roughness in enumerate(levels):
-            s0[:, j], s1[:, j] = lobe(1 + j, float(roughness), SPECULAR_PATHS if j else SHARPEST_PATHS)
+    for j, roughness in enumerate(levels):
+        s0[:, j], s1[:, j] = lobe(1 + j, float(roughness), SPECULAR_PATHS if j else SHARPEST_PATHS)
     image = np.zeros((view.height * view.width, 3), np.float32)
     image[pixels.index] = diffuse
     channels: dict[str, np.ndarray] = {}
     for half in range(2):
         channels |= split_rgb(image.reshape(view.height, view.width, 3), f"half{half}.diffuse")
     job.writer.exr(f"maps/{view.name}.exr", channels, "relative")
-    twice = (np.stack([part[own], part[own]]) for part in (s0, s1))
-    job.writer.table(table_of(view), SpecularLight(pixels.index[own], *twice).columns(), UNITS)
+    twice = (np.stack([part, part]) for part in (s0, s1))
+    job.writer.table(table_of(view), SpecularLight(pixels.index, *twice).columns(), UNITS)
     job.writer.part_done(view.name, [f"maps/{view.name}.exr", table_of(view)], {})
 
 

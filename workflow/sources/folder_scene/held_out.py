@@ -1,4 +1,4 @@
-"""Held-out photographs that the used ones already show: what is held out must not be in what is used."""
+"""Which photographs are held out: what is held out must not be in what is used."""
 
 from __future__ import annotations
 
@@ -29,6 +29,11 @@ class HeldOut:
     distance: np.ndarray
     angle: np.ndarray
 
+    @property
+    def nearest(self) -> str:
+        """How far held-out photographs are from the nearest used one, in words."""
+        return f"{np.median(self.distance):.2g} m and {np.median(self.angle):.2g} degrees from the nearest used one (medians)"
+
     def facts(self, names: Sequence[str]) -> dict[str, object]:
         """Return the entry of capture.json: twins by name, and the medians; empty without a held-out photograph."""
         if not len(self.distance):
@@ -44,11 +49,63 @@ class HeldOut:
             more = f", and {len(self.twins) - 1} more" if len(self.twins) > 1 else ""
             out.append(f"held out as well, because they repeat held-out photographs: {names[first]} ({names[of]}){more}")
         if len(self.distance):
-            out.append(
-                f"held-out photographs are {np.median(self.distance):.2g} m and {np.median(self.angle):.2g} degrees from the"
-                " nearest used one (medians)"
-            )
+            out.append(f"held-out photographs are {self.nearest}")
         return out
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Which photographs `capture.test_every` holds out.
+
+    Attributes:
+        split: `train` or `test` for each photograph.
+        step: median motion between neighbours, as a share of the width of the picture.
+        blocks: stretches that are held out whole; 0 = every n-th photograph.
+    """
+
+    split: list[str]
+    step: float
+    blocks: int
+
+
+def asked(poses: Sequence[np.ndarray], focal: np.ndarray, depth: np.ndarray, every: int) -> Asked:
+    """Hold out one of `every` photographs, and whole stretches of a video.
+
+    From one photograph to the next, surface moves by about m = f (|c_a - c_b| / z + angle(R_a, R_b)), f in widths of the picture.
+    The capture counts as a video if the median of m is below 1 / every: what one held-out photograph shows that its neighbours do
+    not is then less than the share that is held out. Of a video, stretches of ceil(4 / (every m)) photographs are held out, in
+    which half of them are 1 / every or more from both ends.
+
+    Args:
+        poses: (4, 4) `world_from_camera` of n photographs in their order.
+        focal: (n,) focal lengths, in widths of the picture.
+        depth: (n,) median depth of the surface that each shows, metres; NaN = it shows none.
+        every: at least 2.
+    """
+    count = len(poses)
+    split = ["test" if i % every == every - 1 else "train" for i in range(count)]
+    held = split.count("test")
+    if not held:
+        return Asked(split, np.inf, 0)
+    world = np.asarray(poses, np.float64).reshape(-1, 4, 4)
+    apart = np.linalg.norm(np.diff(world[:, :3, 3], axis=0), axis=1)
+    angle = _angle(np.einsum("aij,aij->a", world[:-1, :3, :3], world[1:, :3, :3]))
+    motion = np.asarray(focal)[:-1] * (apart / np.asarray(depth)[:-1] + angle)
+    step = float(np.median(motion[np.isfinite(motion)])) if np.isfinite(motion).any() else np.inf
+    if step >= 1 / every:
+        return Asked(split, step, 0)
+    length = held if step * every * held <= 4 else int(np.ceil(4 / (every * step)))
+    sizes = [len(part) for part in np.array_split(np.arange(held), max(1, round(held / length)))]
+    split = ["train"] * count
+    for number, size in enumerate(sizes):
+        start = int((number + 0.5) * count / len(sizes) - size / 2)
+        split[start : start + size] = ["test"] * size
+    return Asked(split, step, len(sizes))
+
+
+def _angle(trace: np.ndarray) -> np.ndarray:
+    """Return the angle of rotations by their traces, radians."""
+    return np.arccos(np.clip((trace - 1) / 2, -1, 1))
 
 
 def hold_out(
@@ -76,8 +133,7 @@ def hold_out(
         return HeldOut(list(split), {}, np.zeros(0), np.zeros(0))
     centre = every[:, :3, 3]
     apart = np.linalg.norm(centre[tests][:, None] - centre[trains], axis=-1)
-    cosine = np.einsum("aij,bij->ab", every[tests, :3, :3], every[trains, :3, :3])
-    angle = np.arccos(np.clip((cosine - 1) / 2, -1, 1))
+    angle = _angle(np.einsum("aij,bij->ab", every[tests, :3, :3], every[trains, :3, :3]))
     with np.errstate(invalid="ignore"):
         moved = np.asarray(focal)[tests, None] * (apart / np.asarray(depth)[tests, None] + angle)
     same_file = np.asarray(digests)[tests, None] == np.asarray(digests)[None, trains]

@@ -31,7 +31,7 @@ def of_blank(path: Path, blank: Mapping[str, list[str]], count: int) -> list[str
         InputError: all are; the message names `path`, the list of cameras.
     """
     found = {kind: names for kind, names in blank.items() if names}
-    if sum(map(len, found.values())) == count:
+    if found and sum(map(len, found.values())) == count:
         raise InputError(
             f"{path}: all {count} photographs are {' or '.join(found)}"
             f" ({'no light was recorded' if 'black' in found else 'every pixel is saturated'}): check the exposure, and the"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,23 +54,26 @@ def register_frames(
         metres: per unit of the frames' matrices.
 
     Returns:
-        The corrected frames; those given where the correction does not pay.
+        The corrected frames; those given where the correction does not pay. A held-out photograph is neither judged nor left out:
+        nothing but its own pose depends on what it shows.
     """
     seen = [i for i, photo in enumerate(photos) if photo is not None]
+    used = [k for k, i in enumerate(seen) if not photos[i].held]
     if len(seen) < 2:
         return Registered(list(frames), list(poses), {}, {}, [], [])
     plain = all(frames[i].lens.is_identity for i in seen)
     found = register([photos[i] for i in seen], points=max(2000, MAX_ROWS // len(seen)), intrinsics=plain)
     scale = frames[seen[0]].camera.width / photos[seen[0]].image.shape[1]
-    left_out = _unusable([frames[i].name for i in seen], found)
+    names = {frames[seen[k]].name: k for k in used}
+    left_out = _unusable(names, found)
     new_frames, new_poses = list(frames), list(poses)
     if found.accepted:
         for pose, i in zip(found.pose, seen, strict=True):
             new_poses[i] = pose
             new_frames[i] = replace(frames[i], camera=_camera(frames[i], found), matrix=_matrix(pose, axes, metres))
-    moved = float(np.median(found.moved) * scale)
-    decision = decisions.registration(found.accepted, found.gain, found.error, moved, len(left_out), len(seen))
-    facts, words = _facts(frames, seen, found, scale), _words(found, moved, plain)
+    moved = float(np.median(found.moved[used]) * scale) if used else 0.0
+    decision = decisions.registration(found.accepted, found.gain, found.error, moved, len(left_out), len(used))
+    facts, words = _facts(names, found, scale), _words(found, moved, plain)
     return Registered(new_frames, new_poses, left_out, facts, words, [decision])
 
 
@@ -88,9 +91,10 @@ def _matrix(pose: np.ndarray, axes: str, metres: float) -> np.ndarray:
     return out @ np.diag([1.0, -1.0, -1.0, 1.0]) if axes == "opengl" else out
 
 
-def _unusable(names: list[str], found: Registration) -> dict[str, str]:
+def _unusable(names: Mapping[str, int], found: Registration) -> dict[str, str]:
     out = {}
-    for name, sharp, agreement in zip(names, found.sharpness, found.agreement, strict=True):
+    for name, k in names.items():
+        sharp, agreement = found.sharpness[k], found.agreement[k]
         if agreement != 0 and agreement < MIN_AGREEMENT:
             out[name] = f"badly posed? It correlates {agreement:.2f} with what the others show of the same surface"
         elif sharp > 0 and sharp < MIN_SHARPNESS:
@@ -98,15 +102,15 @@ def _unusable(names: list[str], found: Registration) -> dict[str, str]:
     return out if len(names) >= MIN_VIEWS and len(out) <= MAX_SHARE_LEFT_OUT * len(names) else {}
 
 
-def _facts(frames: Sequence[Frame], seen: list[int], found: Registration, scale: float) -> dict[str, Any]:
+def _facts(names: Mapping[str, int], found: Registration, scale: float) -> dict[str, Any]:
     views = {
-        frames[i].name: {
+        name: {
             "moved_px": round(float(found.moved[k] * scale), 2),
             "shift_px": round(float(found.shift[k] * scale), 2),
             "sharpness": round(float(found.sharpness[k]), 3),
             "agreement": round(float(found.agreement[k]), 3),
         }
-        for k, i in enumerate(seen)
+        for name, k in names.items()
     }
     numbers = {
         "accepted": found.accepted,

@@ -1,0 +1,106 @@
+"""Rivals without a model of light: what the other photographs show of the surface of a held-out one."""
+
+import numpy as np
+import pytest
+
+from iif_core.camera.interpolation import Shown, by_others
+from iif_core.camera.view import View
+from iif_core.surface.triangles import face_geometry, towards_viewer
+from tests.unit import own_scene as own
+
+COLOUR = np.array([[0.3, 0.5, 0.2], [0.7, 0.4, 0.6]])  # of the room and of the block in it
+COUNT = 9
+
+
+@pytest.fixture(scope="module")
+def seen(llvm):
+    """Views of the room: camera, z-depth and faces of each."""
+    shape = own.geometry()
+    camera = own.CAMERA
+    intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return [(View(i, str(i), *intrinsics, pose), *own.shoot(shape, pose)[1:]) for i, pose in enumerate(own.poses(COUNT))]
+
+
+def shown(seen, radiance, number):
+    """What a view shows; `radiance`: (H, W, 3)."""
+    view, depth, face = seen[number]
+    return Shown(view, radiance, face >= 0, np.zeros(face.shape, bool), depth)
+
+
+def matte(seen, number):
+    """The room under constant light: every point has the colour of its thing, from everywhere."""
+    face = seen[number][2]
+    return np.where(face[..., None] >= 0, COLOUR[own.room_mesh()[2][face]], 0)
+
+
+def targets(seen, number):
+    """Pixels that hit surface, their points and normals, and the eye."""
+    view, depth, face = seen[number]
+    at, eye = np.flatnonzero(face >= 0), view.world_from_camera[:3, 3]
+    points = view.points(depth, np.float64).reshape(-1, 3)[at]
+    normals = face_geometry(*own.room_mesh()[:2])[0][face.ravel()[at]]
+    return at, points, towards_viewer(normals, eye - points)[0], eye
+
+
+def test_the_mean_is_exact_in_a_matte_room_of_constant_light(seen):
+    others = [shown(seen, matte(seen, i), i) for i in range(1, COUNT)]
+    at, *surface = targets(seen, 0)
+    true = matte(seen, 0).reshape(-1, 3)[at]
+    mean, blend, found = by_others(*surface, others)
+    assert found.mean() > 0.9 and not mean[~found].any()
+    for predicted in (mean, blend):
+        wrong = np.abs(predicted - true)[found].max(1) > 1e-5
+        # Where the block stands on the floor both have one depth, so pixels across that edge are mixed.
+        assert wrong.mean() < 0.03
+
+
+def test_texture_is_as_sharp_as_bilinear_pixels_are(seen):
+    """The colour changes with the place alone: both rivals follow it to the error of the interpolation."""
+    pictures = [own.pattern(view.points(depth, np.float64)) for view, depth, _ in seen]
+    others = [shown(seen, pictures[i], i) for i in range(1, COUNT)]
+    at, *surface = targets(seen, 0)
+    mean, blend, found = by_others(*surface, others)
+    for predicted in (mean, blend):
+        assert np.sqrt(np.mean((predicted - pictures[0].reshape(-1, 3)[at])[found] ** 2)) < 0.01
+
+
+def test_the_photograph_from_the_same_place_has_all_of_the_weight(seen):
+    """Every photograph shows another brightness; the mean is the mean of those that show the point."""
+    others = [shown(seen, np.full((*seen[i][1].shape, 3), float(i + 1)), i) for i in range(COUNT)]
+    _, *surface = targets(seen, 0)
+    mean, blend, found = by_others(*surface, others)
+    assert found.all()
+    np.testing.assert_allclose(blend, 1.0, atol=1e-4)
+    assert mean.mean() > 2
+
+
+def test_weights_fall_with_the_angle_to_zero_at_the_first_that_is_left_out():
+    """A point seen by cameras at 10, 20, 30 and 40 degrees; the two nearest are blended: (1 - a / 30) / a."""
+    pose = np.diag([1.0, 1.0, 1.0, 1.0])
+    others, depth = [], np.full((3, 3), 2.0)
+    for i, degrees in enumerate((10, 20, 30, 40)):
+        a = np.radians(degrees)
+        pose = np.eye(4)
+        pose[:3, 2] = [-np.sin(a), 0, np.cos(a)]
+        pose[:3, 0] = [np.cos(a), 0, np.sin(a)]
+        pose[:3, 3] = [2 * np.sin(a), 0, 2 - 2 * np.cos(a)]
+        view = View(i, str(i), 3, 3, 30.0, 30.0, 1.5, 1.5, pose)
+        others.append(Shown(view, np.full((3, 3, 3), 10.0**i), np.ones((3, 3), bool), np.zeros((3, 3), bool), depth))
+    surface = np.array([[0.0, 0.0, 2.0]]), np.array([[0.0, 0.0, -1.0]]), np.zeros(3)
+    mean, blend, _ = by_others(*surface, others, nearest=2)
+    np.testing.assert_allclose(mean[0], 1111 / 4)
+    weight = (1 - np.array([10, 20]) / 30) / np.array([10, 20])
+    np.testing.assert_allclose(blend[0], (weight * [1, 10]).sum() / weight.sum(), rtol=1e-4)
+    # A saturated photograph is only a bound, and counts where there is no other.
+    bound = [Shown(o.camera, o.radiance, o.usable, o.bound | (i < 3), o.depth) for i, o in enumerate(others)]
+    np.testing.assert_allclose(by_others(*surface, bound)[0], 1000)
+    every = [Shown(o.camera, o.radiance, o.usable, ~o.bound, o.depth) for o in others]
+    np.testing.assert_allclose(by_others(*surface, every)[0], 1111 / 4)
+
+
+def test_what_stands_behind_or_faces_away_is_not_seen():
+    view, depth = View(0, "a", 3, 3, 30.0, 30.0, 1.5, 1.5, np.eye(4)), np.full((3, 3), 2.0)
+    one = Shown(view, np.ones((3, 3, 3)), np.ones((3, 3), bool), np.zeros((3, 3), bool), depth)
+    points = np.array([[0, 0, 2.0], [0, 0, 2.2], [0, 0, -2.0], [0, 0, 2.0], [9, 0, 2.0]])
+    normals = np.array([[0, 0, -1.0], [0, 0, -1.0], [0, 0, 1.0], [0, 0, 1.0], [0, 0, -1.0]])
+    assert by_others(points, normals, np.zeros(3), [one])[2].tolist() == [True, False, False, False, False]
