@@ -31,9 +31,7 @@ def write_fit(job: Job, inputs: FitInputs, fit: FitResult, solver: str) -> None:
     albedo = inputs.textures.albedo(fit) if inputs.textures is not None else None
     _write_cells(job, fit, albedo)
     _write_maps(job, capture, fit, albedo)
-    plan = _plan_of_fit(
-        inputs.problem, fit, inputs.calibration, capture.facts["dynamic_range"], job.settings.components.metallic
-    )
+    plan = _plan_of_fit(inputs.problem, fit, inputs.calibration, capture.facts["dynamic_range"], job.settings.components.metallic)
     if given is not None:
         plan.append(materials.given_by_hand(names, given))
     _write_facts(job, solver, fit, plan)

@@ -61,9 +61,7 @@ class ViewRecord:
     seen: np.ndarray | None = None
 
     @classmethod
-    def of(
-        cls, maps: ViewMaps, normals: np.ndarray, base: np.ndarray | None, among: np.ndarray | None = None
-    ) -> ViewRecord:
+    def of(cls, maps: ViewMaps, normals: np.ndarray, base: np.ndarray | None, among: np.ndarray | None = None) -> ViewRecord:
         """Collect what is read of a view.
 
         Args:

@@ -103,9 +103,7 @@ class _Rows:
 
     def take(self, keep: np.ndarray) -> _Rows:
         """Some of the pixels."""
-        return replace(
-            self, pixels=self.pixels.take(keep), shown=self.shown.take(keep), transport=self.transport.take(keep)
-        )
+        return replace(self, pixels=self.pixels.take(keep), shown=self.shown.take(keep), transport=self.transport.take(keep))
 
     def held_out(self, disc: Disc) -> tuple[float, float]:
         """Misfit without a sun and with it: every second view under the light and the gains that the others have, and the other
