@@ -178,6 +178,8 @@ STAGES: dict[str, Stage] = {
             "Write the result for other programs: glTF, Mitsuba, tables.",
             ("capture", "segmentation", "base", "emission", "second_look", "affines", "unwrap"),
             ("export",),
+            reads_raw=True,
+            files=("workflow.exporters.held",),
             threads=1,
         ),
         Stage(
@@ -186,7 +188,7 @@ STAGES: dict[str, Stage] = {
             ("capture", "segmentation", "base", "emission", "second_look", "affines", "unwrap"),
             ("room", "report.credit", "seed"),
             reads_raw=True,
-            files=("workflow.room.sources",),
+            files=("workflow.room.sources", "workflow.exporters.held"),
         ),
         Stage(
             "report",
@@ -194,7 +196,7 @@ STAGES: dict[str, Stage] = {
             _REPORTED,
             ("report",),
             reads_raw=True,
-            files=("workflow.report.sources",),
+            files=("workflow.report.sources", "workflow.exporters.held"),
             threads=1,
         ),
         Stage(

@@ -16,7 +16,7 @@ from iif_core.fitting.pixels import Pixels, evaluate_clusters
 from iif_core.fitting.problem import FitOptions
 from iif_core.fitting.tone import Tone
 from iif_core.numerics.color import srgb_from_linear
-from iif_core.reflectance.material import BIASES, NUMBERS, ROUGHNESS
+from iif_core.reflectance.material import BIASES, NUMBERS
 
 _LARGEST_STEP = 1.5
 """Largest logarithm of a ratio that one linear step may report."""
@@ -388,16 +388,3 @@ def level_deviation(affine: np.ndarray, covariance: np.ndarray, mean_base: np.nd
     brightness = np.einsum("oi,oi->o", row, affine)
     variance = np.maximum(np.einsum("oi,oij,oj->o", row, covariance, row), 0.0)
     return np.where(brightness > 0, np.sqrt(variance) / np.maximum(brightness, 1e-12), 0.0)
-
-
-def roughness_deviation(covariance: np.ndarray, mean_base: np.ndarray) -> np.ndarray:
-    """Return the standard deviation of the roughness of each object at its mean base roughness, (O,); 0 where it was not fitted.
-
-    Factor and offset of `g x + h` trade with each other, so their errors do not add up as if they were independent.
-
-    Args:
-        covariance: (O, 16, 16) of the numbers; mean_base: (O,) mean base roughness.
-    """
-    row = np.stack([mean_base, np.ones_like(mean_base)], 1)
-    own = covariance[:, ROUGHNESS][:, :, ROUGHNESS]
-    return np.sqrt(np.maximum(np.einsum("oi,oij,oj->o", row, own, row), 0.0))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.camera.response import response_facts
-from iif_core.fitting.object_levels import level_deviation, roughness_deviation
+from iif_core.fitting.object_levels import level_deviation
 from iif_core.fitting.problem import FitProblem, FitResult, albedo_uncertainty
 from iif_core.reflectance.material import CHANNELS, NUMBERS_OF, apply_affines
 from workflow.artifacts.store import ids_from_disk, split_rgb
@@ -73,10 +73,9 @@ def _write_objects(job: Job, names: list[str], fit: FitResult, given: np.ndarray
     columns |= {f"T_{name}": fit.affine[:, part] for name, part in NUMBERS_OF.items()}
     columns |= {f"std_{name}": spread[:, part] for name, part in NUMBERS_OF.items()}
     means = read_base(job).table("objects.parquet")
-    mean = np.stack([means[name] for name in CHANNELS], 1)[: len(names)]
+    mean = np.stack([means[f"albedo_{c}"] for c in "rgb"], 1)[: len(names)]
     columns |= {
-        "std_level": level_deviation(fit.affine, fit.covariance, mean[:, :3]),
-        "std_mean_roughness": roughness_deviation(fit.covariance, mean[:, 3]),
+        "std_level": level_deviation(fit.affine, fit.covariance, mean),
         "covariance_trace": np.trace(fit.covariance, axis1=1, axis2=2),
         "residual": fit.residual,
         "light_gain": np.ones(len(names)) if fit.light_gain is None else fit.light_gain,
