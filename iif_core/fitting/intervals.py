@@ -47,12 +47,14 @@ class MeasuredErrors:
 
     Attributes:
         additive: error of an albedo that does not grow with it; hue: error of the logarithm of a channel relative to the
-            brightness. Both are halves of central 68 % intervals.
+            brightness; border: error of the logarithm of an albedo that one pixel shows, by what borders mix into it, which
+            falls with the root of the pixels. All are halves of central 68 % intervals.
         albedo, roughness, metallic: the factor lambda of each.
     """
 
     additive: float
     hue: float
+    border: float
     albedo: float
     roughness: float
     metallic: float
@@ -101,7 +103,7 @@ def pooled(variance: ArrayLike, freedom: ArrayLike) -> tuple[NDArray, NDArray]:
     v = np.asarray(variance, np.float64)
     total = v.sum(-1)
     share = v / np.maximum(total, np.finfo(float).tiny)[..., None]
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", over="ignore"):
         return total, 1.0 / (share**2 / np.asarray(freedom, np.float64)).sum(-1)
 
 
@@ -166,24 +168,28 @@ class AlbedoIntervals:
     additive: float
 
     @classmethod
-    def of(cls, albedo: ArrayLike, level: ArrayLike, room: float, kinds: Kinds, errors: MeasuredErrors) -> AlbedoIntervals:
+    def of(
+        cls, albedo: ArrayLike, level: ArrayLike, pixels: ArrayLike, room: float, kinds: Kinds, errors: MeasuredErrors
+    ) -> AlbedoIntervals:
         """Combine the errors of the mean albedo of objects.
 
         Args:
-            albedo: (O, 3) linear, >= 0.
+            albedo: (O, 3) linear; outside [0, 1] it counts as at the ends.
             level: (O,) error of the logarithm of an object's brightness within the room; 0 or not finite: not known.
+            pixels: (O,) that show the object; less than 1 counts as 1.
             room: error of the logarithm of the level of the room; not finite: not known.
             kinds: what the fit left open; errors: measured.
         """
         a, level = np.asarray(albedo, np.float64), np.asarray(level, np.float64)
         known = (level > 0) & np.isfinite(level) & np.isfinite(room) & np.isfinite(a).all(1)
-        a = np.where(known[:, None], np.maximum(a, 0.0), 0.5)
-        parts = np.stack(np.broadcast_arrays(np.where(known, level, 1.0), room, errors.hue), 1)
+        a = np.where(known[:, None], np.clip(a, 0.0, 1.0), 0.5)
+        border = errors.border / np.sqrt(np.fmax(np.asarray(pixels, np.float64), 1.0))
+        parts = np.stack(np.broadcast_arrays(np.where(known, level, 1.0), room, errors.hue, border), 1)
         parts = np.minimum(np.nan_to_num(parts), _LARGEST) ** 2
         relative = np.clip(np.sqrt(parts.sum(1)), _SMALLEST, _LARGEST)[:, None]
         additive = max(errors.additive, _SMALLEST)
         every = np.concatenate([parts[:, None] * a[..., None] ** 2, np.full((*a.shape, 1), additive**2)], -1)
-        freedom = pooled(every, [_DEGREES_OF_FREEDOM, np.inf, np.inf, np.inf])[1][..., None]
+        freedom = pooled(every, [_DEGREES_OF_FREEDOM, *[np.inf] * 4])[1][..., None]
         weight, shift = _mixture(kinds, kinds.brightness)
         own = cls(np.zeros_like(a), np.zeros_like(a), np.zeros_like(a), relative, additive)
         middle = own.scale(a)
@@ -269,7 +275,7 @@ class MetallicIntervals:
         for columns in ([0, 2], [1, 2]):
             share = np.clip(weight[:, columns].sum(1) / weight.sum(1), _RAREST, 1.0 - _RAREST)
             ends.append(np.where(unknown, 0.0, logit(share) / logit(1.0 - PROBABILITY)))
-        return cls(np.where(np.isfinite(m), m, 0.5), *ends)
+        return cls(np.where(np.isfinite(m), np.clip(m, 0.0, 1.0), 0.5), *ends)
 
     def ends(self, factor: float) -> tuple[NDArray, NDArray]:
         """Return the lower and upper ends (O,) in [0, 1], with log odds of kinds divided by `factor` > 0."""

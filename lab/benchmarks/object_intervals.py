@@ -26,6 +26,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
+from scipy.optimize import minimize
 from scipy.special import stdtrit
 
 import lab  # noqa: F401  for the sources of the laboratory
@@ -46,13 +47,11 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 ROWS, PAGE = REPOSITORY / "lab/notebook/data/object_intervals.csv", REPOSITORY / "lab/notebook/intervals.md"
 KINDS = ("probability", "brightness", "roughness", "deviation")
 COLUMNS = (
-    "scene", "object", "cells", "room_error", "level", "seen",
+    "scene", "object", "cells", "pixels", "room_error", "level", "seen",
     *CHANNELS, *(f"true_{name}" for name in CHANNELS), *(f"{name}_{k}" for name in KINDS for k in range(3)),
 )  # fmt: skip
-DARK = 0.1
-"""Objects with a lower albedo do not tell the error of hue, which the additive error would hide there."""
-ADDITIVE = np.geomspace(3e-4, 0.1, 60)
-"""Additive errors among which the most likely is sought."""
+DARK, FEW = 0.1, 500
+"""Objects of a lower albedo or of fewer pixels do not tell the error of hue: the additive error and borders hide it there."""
 SIGMA = 0.6827
 """Share of a normal distribution within one standard deviation."""
 Array = np.ndarray
@@ -61,7 +60,7 @@ Array = np.ndarray
 @dataclass(frozen=True)
 class Room:
     """Objects of a room: estimates and truths (O, 5) of `CHANNELS`, errors (O,) of their levels, error of the room's level, cells
-    (O,) that count, and what the fit left open of kinds."""
+    (O,) whose truth is known, pixels (O,) of the fit, and what it left open of kinds."""
 
     scene: str
     estimate: Array
@@ -69,6 +68,7 @@ class Room:
     level: Array
     room_error: float
     cells: Array
+    pixels: Array
     kinds: Kinds
 
     @property
@@ -77,7 +77,7 @@ class Room:
         return self.scene.partition("--")[0]
 
     def albedo(self, errors: MeasuredErrors) -> AlbedoIntervals:
-        return AlbedoIntervals.of(self.estimate[:, :3], self.level, self.room_error, self.kinds, errors)
+        return AlbedoIntervals.of(self.estimate[:, :3], self.level, self.pixels, self.room_error, self.kinds, errors)
 
     def roughness(self) -> RoughnessIntervals:
         return RoughnessIntervals.of(self.estimate[:, 3], self.kinds)
@@ -124,8 +124,8 @@ def measured(scene: str, quality: str, cells: int) -> Iterator[dict[str, Any]]:
     kinds = kinds_of(objects, n)
     room_error = fitted.json("affines.json")["scale"]["relative_error"]
     for o in np.flatnonzero(count >= cells):
-        facts = {"scene": scene, "object": int(o), "cells": int(count[o]), "room_error": room_error}
-        facts |= {"level": objects["std_level"][o], "seen": kinds.seen[o]}
+        facts = {"scene": scene, "object": int(o), "cells": int(count[o]), "pixels": int(objects["pixels"][o])}
+        facts |= {"room_error": room_error, "level": objects["std_level"][o], "seen": kinds.seen[o]}
         facts |= dict(zip(CHANNELS, estimates[o], strict=True))
         facts |= {f"true_{name}": value for name, value in zip(CHANNELS, truths[o], strict=True)}
         facts |= {f"{name}_{k}": getattr(kinds, name)[o, k] for name in KINDS for k in range(3)}
@@ -165,8 +165,8 @@ def rooms_of(table: Sequence[Mapping[str, str]]) -> list[Room]:
 
         kinds = Kinds(**{name: columns(*(f"{name}_{k}" for k in range(3))) for name in KINDS}, seen=columns("seen")[:, 0])
         truth = columns(*(f"true_{name}" for name in CHANNELS))
-        level, room_error, cells = columns("level", "room_error", "cells").T
-        rooms.append(Room(scene, columns(*CHANNELS), truth, level, float(room_error[0]), cells, kinds))
+        level, room_error, *counts = columns("level", "room_error", "cells", "pixels").T
+        rooms.append(Room(scene, columns(*CHANNELS), truth, level, float(room_error[0]), *counts, kinds))
     return rooms
 
 
@@ -174,14 +174,18 @@ def rooms_of(table: Sequence[Mapping[str, str]]) -> list[Room]:
 
 
 def fitted(rooms: Sequence[Room]) -> MeasuredErrors:
-    """Measure additive error, error of hue and the factors. Every room weighs the same.
+    """Measure the error of hue, the most likely additive error and error of borders, and the factors. Every room weighs the same.
 
     Raises:
         InputError: there are too few objects for a factor.
     """
     hue = _quantile([_away_in_hue(room) for room in rooms], SIGMA)
-    additive = max(ADDITIVE, key=lambda size: sum(_log_likelihood(room, hue, size) for room in rooms))
-    errors = MeasuredErrors(float(additive), hue, 1.0, 1.0, 1.0)
+
+    def unlikely(logs: Array) -> float:
+        return -sum(_log_likelihood(room, hue, *np.exp(logs)) for room in rooms)
+
+    additive, border = np.exp(minimize(unlikely, np.log([0.01, 1.0]), method="Nelder-Mead").x)
+    errors = MeasuredErrors(float(additive), hue, float(border), 1.0, 1.0, 1.0)
     factors = {
         "albedo": _factor(rooms, lambda room: (own := room.albedo(errors)).residual(room.truth[:, :3])[np.isfinite(own.above)]),
         "roughness": _factor(rooms, lambda room: (own := room.roughness()).residual(room.truth[:, 3])[np.isfinite(own.above)]),
@@ -194,17 +198,18 @@ def fitted(rooms: Sequence[Room]) -> MeasuredErrors:
 
 
 def _away_in_hue(room: Room) -> Array:
-    use = room.estimate[:, :3].mean(1) >= DARK
+    use = (room.estimate[:, :3].mean(1) >= DARK) & (room.pixels >= FEW)
     ratio = np.log(np.maximum(room.estimate[use, :3], 1e-3) / np.maximum(room.truth[use, :3], 1e-3))
     brightness = np.log(room.estimate[use, :3].mean(1) / np.maximum(room.truth[use, :3].mean(1), 1e-3))
     return np.abs(ratio - brightness[:, None]).ravel()
 
 
-def _log_likelihood(room: Room, hue: float, additive: float) -> float:
+def _log_likelihood(room: Room, hue: float, additive: float, border: float) -> float:
     """Mean log density of the true albedos: Student's t on the scale of Eq. M.58, times its slope 1 / sqrt((s a)^2 + delta^2)."""
     known = room.level > 0
     estimate, truth = room.estimate[known, :3], room.truth[known, :3]
-    relative = np.sqrt(room.level[known] ** 2 + room.room_error**2 + hue**2)[:, None]
+    relative = room.level[known] ** 2 + room.room_error**2 + hue**2 + border**2 / np.maximum(room.pixels[known], 1.0)
+    relative = np.sqrt(relative)[:, None]
     away = np.diff([np.arcsinh(relative * a / additive) / relative for a in (estimate, truth)], axis=0)
     z = away * stdtrit(4.0, 0.5 + 0.5 * SIGMA)
     return float((-2.5 * np.log1p(z**2 / 4.0) - np.log(np.hypot(relative * truth, additive))).mean())
@@ -261,7 +266,7 @@ def left_out(rooms: Sequence[Room]) -> list[dict[str, float]]:
 def terms(rooms: Sequence[Room]) -> list[list[str]]:
     """Return what each term adds to the intervals of albedo: shares of channels held and half widths, means over the rooms."""
     everything = fitted(rooms)
-    none = replace(everything, additive=1e-6, hue=1e-6)
+    none = replace(everything, additive=1e-6, hue=1e-6, border=1e-6)
     normal = float(student_width(np.inf) / student_width(4.0))
 
     def without(room: Room, level: bool = True) -> Room:
@@ -273,7 +278,8 @@ def terms(rooms: Sequence[Room]) -> list[list[str]]:
         ("Student's t of four degrees of freedom", lambda room: without(room, False), none, 1.0),
         ("error of the room's level", without, none, 1.0),
         ("error of hue", without, replace(none, hue=everything.hue), 1.0),
-        ("additive error", without, everything, 1.0),
+        ("additive error", without, replace(everything, border=1e-6), 1.0),
+        ("error of borders", without, everything, 1.0),
         ("other kinds", lambda room: room, everything, 1.0),
     ]
     out = []

@@ -18,6 +18,7 @@ from workflow.scene.recovered import Recovered
 
 Array = np.ndarray
 
+
 def object_rows(
     names: Sequence[str],
     cell_object: Array,
@@ -44,7 +45,8 @@ def object_rows(
     mean = np.where(count[:, None] > 0, mean / np.maximum(count, 1)[:, None], object_values[:n])
     mean = np.clip(mean, 0, 1)
     errors, kinds = MeasuredErrors.from_facts(measured()["errors"], str(FILE)), kinds_of(fit, n)
-    low, high = AlbedoIntervals.of(mean[:, :3], _by_id(fit, "std_level", n), room_error, kinds, errors).ends(errors.albedo)
+    level, pixels = _by_id(fit, "std_level", n), _by_id(fit, "pixels", n)
+    low, high = AlbedoIntervals.of(mean[:, :3], level, pixels, room_error, kinds, errors).ends(errors.albedo)
     of_others = {
         "roughness": RoughnessIntervals.of(mean[:, 3], kinds).ends(errors.roughness),
         "metallic": MetallicIntervals.of(mean[:, 4], kinds).ends(errors.metallic),
