@@ -89,8 +89,13 @@ class Room:
     def level_error(self) -> float:
         """Logarithm of the estimated over the true level of the room: median over its surface."""
         ratio = np.log(np.maximum(self.estimate[:, :3].mean(1), 1e-3) / np.maximum(self.truth[:, :3].mean(1), 1e-3))
-        order = np.argsort(ratio)
-        return float(ratio[order][np.searchsorted(np.cumsum(self.cells[order]), 0.5 * self.cells.sum())])
+        return _middle(ratio, self.cells)
+
+
+def _middle(values: Array, weight: Array, share: float = 0.5) -> float:
+    """Return the weighted median, or another quantile."""
+    order = np.argsort(values)
+    return float(values[order][np.searchsorted(np.cumsum(weight[order]), share * weight.sum())])
 
 
 # ------------------------------------------------------------------------------------------------------------ measuring
@@ -179,7 +184,7 @@ def fitted(rooms: Sequence[Room]) -> MeasuredErrors:
     Raises:
         InputError: there are too few objects for a factor.
     """
-    hue = _quantile([_away_in_hue(room) for room in rooms], SIGMA)
+    hue = _middle(*_weighted([_away_in_hue(room) for room in rooms]), SIGMA)
 
     def unlikely(logs: Array) -> float:
         return -sum(_log_likelihood(room, hue, *np.exp(logs)) for room in rooms)
@@ -219,19 +224,14 @@ def _factor(rooms: Sequence[Room], residual: Callable[[Room], Array]) -> float:
     return conformal_factor(*_weighted([np.ravel(residual(room)) for room in rooms]))
 
 
-def _quantile(found: Sequence[Array], share: float) -> float:
-    values, weight = _weighted(found)
-    order = np.argsort(values)
-    return float(values[order][np.searchsorted(np.cumsum(weight[order]), share * weight.sum())])
-
-
 def _weighted(found: Sequence[Array]) -> tuple[Array, Array]:
     """Join the values of rooms, with weights that add up to 1 in each."""
     return np.concatenate(found), np.concatenate([np.full(len(values), 1.0 / max(len(values), 1)) for values in found])
 
 
 def coverage(room: Room, errors: MeasuredErrors) -> dict[str, float]:
-    """Return shares of held truths, half widths (medians), and how much is claimed, of a room under errors of others."""
+    """Return shares of held truths, half widths (medians over the objects, the relative one over the surface), and how much is
+    claimed, of a room under errors of others."""
     low, high = room.albedo(errors).ends(errors.albedo)
     truth, middle = room.truth, room.estimate[:, :3].mean(1)
     out = {
@@ -239,7 +239,7 @@ def coverage(room: Room, errors: MeasuredErrors) -> dict[str, float]:
         "albedo": float(((low <= truth[:, :3]) & (truth[:, :3] <= high)).mean()),
         "brightness": float(((low.mean(1) <= truth[:, :3].mean(1)) & (truth[:, :3].mean(1) <= high.mean(1))).mean()),
         "albedo_width": float(np.median(0.5 * (high - low))),
-        "relative_width": float(np.median(0.5 * (high - low).mean(1) / np.maximum(middle, 1e-3))),
+        "relative_width": _middle(0.5 * (high - low).mean(1) / np.maximum(middle, 1e-3), room.cells),
         "level": float(abs(room.level_error) <= student_width(np.inf) * room.room_error),
     }
     for name, own, column in (("roughness", room.roughness(), 3), ("metallic", room.metallic(), 4)):
@@ -326,7 +326,7 @@ def tables(rooms: Sequence[Room], found: Sequence[Mapping[str, float]], errors: 
     pooled = [_percent(np.average([row[name] for row in found], weights=weight)) for name in shares]
     rows.append(["**all objects**", objects, *pooled, *[""] * 5])
     heads = ["room", "objects", "R, G, B", "brightness", "roughness", "metallic", "level of the room, error ± half of 95 %"]
-    heads += ["half width: R, G, B", "relative", "roughness, where claimed", "roughness claimed of"]
+    heads += ["half width: R, G, B", "relative, of the surface", "roughness, where claimed", "roughness claimed of"]
     metals = sum(row["metals"] for row in found)
     held = sum(row["metals"] * np.nan_to_num(row["metals_held"]) for row in found)
     numbers = [[name, f"{value:.3g}"] for name, value in vars(errors).items()]
@@ -334,7 +334,7 @@ def tables(rooms: Sequence[Room], found: Sequence[Mapping[str, float]], errors: 
     numbers += [["held, where an interval of roughness is claimed", _percent(means["roughness_of_claimed"])]]
     return {
         "intervals": "\n".join(markdown(heads, rows)),
-        "terms": "\n".join(markdown(["with", "R, G, B held", "in a room", "half width, relative"], terms(rooms))),
+        "terms": "\n".join(markdown(["with", "R, G, B held", "in a room", "half width, relative, of the surface"], terms(rooms))),
         "constants": "\n".join(markdown(["number", "value"], numbers)),
     }
 

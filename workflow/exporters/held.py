@@ -23,6 +23,11 @@ def measured() -> dict[str, Any]:
     return json.loads(FILE.read_text())
 
 
+def rooms() -> int:
+    """Return the number of rooms with truth from which the intervals are."""
+    return len(measured()["rooms"])
+
+
 def words(quantity: str) -> str:
     """Say what the 95 % intervals of a quantity held in rooms with truth, e.g. `94 % (88 to 100 % in a room)`."""
     held = measured()["held"][quantity]

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from workflow.exporters import held
 from workflow.report.wording import percent
 
 GREEN, AMBER, RED = "green", "amber", "red"
@@ -385,7 +386,7 @@ def _materials(e: Evidence) -> Light:
 
 
 def _gloss(e: Evidence) -> list[Finding | None]:
-    """Judge roughness and metallic: by the truth, or else by what the fit claims, which is too little by experience."""
+    """Judge roughness and metallic: by the truth, or else by their intervals."""
     remedy = "Compare 'roughness' of result and truth; what you know, set under `materials` in the scene file"
     if e.has_truth:
         return [
@@ -399,19 +400,15 @@ def _gloss(e: Evidence) -> list[Finding | None]:
         ]  # fmt: skip
     remedy = "Photograph what shines from more directions; what you know, set under `materials` in the scene file"
     if e.roughness_interval is None:
-        return [Finding(AMBER, "Roughness was measured on less than 50 % of the surface seen; elsewhere it is a guess", remedy)]
+        return [Finding(AMBER, "Photographs show the roughness of less than 50 % of the surface; the rest is guessed", remedy)]
     return [
         _finding(
             "roughness_interval", e.roughness_interval,
-            "Roughness is known to within ±{} by the fit's own claim of 95 %, which held for"
-            f" {ROUGHNESS_HELD[0]} to {ROUGHNESS_HELD[1]} % of the objects in rooms with truth",
+            f"Roughness is known to within ±{{}}; in {held.rooms()} rooms with truth, 95 % intervals of roughness held"
+            f" for {held.words('roughness')} of the objects",
             remedy, ".2f", AMBER,
         )
     ]  # fmt: skip
-
-
-ROUGHNESS_HELD = (76, 85)
-"""Per cent of the objects whose true roughness is inside the 95 % interval, in three rooms (docs/guide/accuracy.md)."""
 
 
 def _off(psnr: float | None) -> str:

@@ -59,7 +59,7 @@ def _about(job: Job) -> list[str]:
         "Materials and lamps were recovered from photographs. The light of each lamp was traced once, with all reflections"
         f" ({samples} paths for each texel), and stored; the page adds the lamps up, so that strengths and colours are exact for"
         " diffuse light.",
-        "Intervals are 95 % intervals of the fit; the interval of albedo is for its brightness.",
+        "Intervals are 95 % intervals; roughness that no photograph shows has 0 to 1.",
     ]
 
 
