@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit, logit, stdtr, stdtrit
+from scipy.special import logit, stdtr, stdtrit
 
 from iif_core.errors import InputError
 from iif_core.fitting.problem import Kinds
@@ -30,8 +30,6 @@ _DEGREES_OF_FREEDOM = 4.0
 """Of Student's t of the errors that the fit states (Eq. M.34, M.56)."""
 _PROFILE_ERROR = 0.05
 """Error of a profiled roughness by the grid of the profile, half its spacing."""
-_RANGE = (0.01, 0.99)
-"""Roughness outside counts as at these ends, because the logit is infinite at 0 and 1."""
 _SMALLEST, _LARGEST = 1e-6, 30.0
 """Limits of errors, which keep scales finite; an interval is 0 to 1 long before the upper one."""
 _RAREST = 1e-12
@@ -218,10 +216,10 @@ class AlbedoIntervals:
 
 @dataclass(frozen=True)
 class RoughnessIntervals:
-    """Intervals of roughness, on its logit (Eq. M.60).
+    """Intervals of roughness, cut off at 0 and 1 (Eq. M.60).
 
     Attributes:
-        middle: (O,) on the scale; below, above: (O,) half widths, infinite where the photographs do not show it.
+        middle: (O,); below, above: (O,) half widths, infinite where the photographs do not show it.
     """
 
     middle: NDArray
@@ -233,23 +231,22 @@ class RoughnessIntervals:
         """Combine the errors of the mean roughness (O,) of objects with what the fit left open."""
         r = np.asarray(roughness, np.float64)
         known = np.isfinite(r) & (kinds.seen >= LEAST_SEEN)
+        middle = np.where(known, np.clip(r, 0.0, 1.0), 0.5)
         weight, of_kind = _mixture(kinds, kinds.roughness)
         chosen = weight.argmax(1)[:, None] == np.arange(weight.shape[1])
-        inside = np.clip(np.where(chosen & known[:, None], r[:, None], of_kind), *_RANGE)
+        of_kind = np.where(chosen, middle[:, None], np.clip(of_kind, 0.0, 1.0))
         error = np.hypot(np.minimum(np.nan_to_num(kinds.deviation), _LARGEST), _PROFILE_ERROR)
-        # To first order, the logit of r has the error of r over r (1 - r).
-        error, freedom = error / (inside * (1.0 - inside)), np.full_like(inside, _DEGREES_OF_FREEDOM)
-        low, high = (mixture_quantile(p, weight, logit(inside), error, freedom) for p in (_OUTSIDE, 1.0 - _OUTSIDE))
-        middle = logit(np.clip(np.where(known, r, 0.5), *_RANGE))
+        freedom = np.full_like(error, _DEGREES_OF_FREEDOM)
+        low, high = (mixture_quantile(p, weight, of_kind, error, freedom) for p in (_OUTSIDE, 1.0 - _OUTSIDE))
         return cls(middle, *_half_widths(middle, low, high, known))
 
     def ends(self, factor: float) -> tuple[NDArray, NDArray]:
         """Return the lower and upper ends (O,) in [0, 1], half widths times `factor` > 0."""
-        return expit(self.middle - factor * self.below), expit(self.middle + factor * self.above)
+        return np.clip(self.middle - factor * self.below, 0.0, 1.0), np.clip(self.middle + factor * self.above, 0.0, 1.0)
 
     def residual(self, truth: ArrayLike) -> NDArray:
         """Return the factors (O,) with which the intervals just reach true roughness; 0 where nothing is claimed."""
-        return _normalised(logit(np.clip(truth, *_RANGE)) - self.middle, self.below, self.above)
+        return _normalised(np.asarray(truth, np.float64) - self.middle, self.below, self.above)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
-from scipy.special import expit, logit
 
 from iif_core.errors import InputError
 from iif_core.fitting.intervals import (
@@ -164,11 +163,16 @@ def test_stated_errors_of_the_model_are_held_as_often_as_claimed():
 # ------------------------------------------------------------------------------------------------- roughness, metallic
 
 
-def test_roughness_has_its_interval_on_the_logit():
-    own = RoughnessIntervals.of([0.4], kinds(deviation=0.12))
-    low, high = own.ends(1.5)
-    half = 1.5 * Q4 * np.hypot(0.12, 0.05) / (0.4 * 0.6)
-    assert (low[0], high[0]) == pytest.approx((expit(logit(0.4) - half), expit(logit(0.4) + half)))
+def test_roughness_has_the_errors_of_profile_and_grid():
+    low, high = RoughnessIntervals.of([0.4, 0.9], kinds(2, deviation=0.12)).ends(0.8)
+    half = 0.8 * Q4 * np.hypot(0.12, 0.05)
+    assert low == pytest.approx([0.4 - half, 0.9 - half]) and high == pytest.approx([0.4 + half, 1.0])
+    both = RoughnessIntervals.of([0.4], kinds(probability=(0.7, 0.3, 0.0), roughness=(0.4, 0.8, 0.0), deviation=0.12)).ends(1.0)
+    rng = np.random.default_rng(3)
+    draws = np.where(rng.random(400_000) < 0.3, 0.8, 0.4) + np.hypot(0.12, 0.05) / 1.1416 * rng.standard_t(4, 400_000)
+    assert (both[0][0], both[1][0]) == pytest.approx(
+        (max(np.quantile(draws, 0.025), 0), min(np.quantile(draws, 0.975), 1)), abs=0.01
+    )
 
 
 def test_roughness_that_no_photograph_shows_is_0_to_1():
