@@ -179,7 +179,7 @@ STAGES: dict[str, Stage] = {
             ("capture", "segmentation", "base", "emission", "second_look", "affines", "unwrap"),
             ("export",),
             reads_raw=True,
-            files=("workflow.exporters.held",),
+            files=("workflow.decisions.held",),
             threads=1,
         ),
         Stage(
@@ -188,7 +188,7 @@ STAGES: dict[str, Stage] = {
             ("capture", "segmentation", "base", "emission", "second_look", "affines", "unwrap"),
             ("room", "report.credit", "seed"),
             reads_raw=True,
-            files=("workflow.room.sources", "workflow.exporters.held"),
+            files=("workflow.room.sources", "workflow.decisions.held"),
         ),
         Stage(
             "report",
@@ -196,7 +196,7 @@ STAGES: dict[str, Stage] = {
             _REPORTED,
             ("report",),
             reads_raw=True,
-            files=("workflow.report.sources", "workflow.exporters.held"),
+            files=("workflow.report.sources", "workflow.decisions.held"),
             threads=1,
         ),
         Stage(

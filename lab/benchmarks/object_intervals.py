@@ -7,7 +7,7 @@
 Run it in a working folder. `--make` takes any scenes of lab/config/studies/scenes.yaml, under the settings of a variant of study
 `intervals`, up to stage affines, one after the other. The rows of each room, one for each object, replace those that it had in
 lab/notebook/data/object_intervals.csv as soon as it is finished. Of all rooms there, the command then writes
-workflow/exporters/intervals.json, which the product reads, and the tables of lab/notebook/intervals.md. Truth and estimate of
+workflow/decisions/intervals.json, which the product reads, and the tables of lab/notebook/intervals.md. Truth and estimate of
 an object are means over its surface cells, which have equal areas; truth is known where photographs show it, and objects with
 fewer such cells than `--cells` are left out.
 """
@@ -41,7 +41,7 @@ from iif_core.fitting.intervals import (
 )
 from iif_core.fitting.problem import Kinds
 from iif_core.reflectance.material import CHANNELS
-from workflow.exporters.held import FILE
+from workflow.decisions.held import FILE
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 ROWS, PAGE = REPOSITORY / "lab/notebook/data/object_intervals.csv", REPOSITORY / "lab/notebook/intervals.md"

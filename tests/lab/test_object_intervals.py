@@ -13,7 +13,7 @@ from iif_core.errors import InputError
 from iif_core.fitting.intervals import MeasuredErrors
 from iif_core.fitting.problem import Kinds
 from lab.benchmarks import object_intervals as measurement
-from workflow.exporters.held import FILE
+from workflow.decisions.held import FILE
 
 TRUE = MeasuredErrors(additive=0.01, hue=0.05, border=2.0, albedo=1.0, roughness=1.0, metallic=1.0)
 

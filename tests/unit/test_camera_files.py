@@ -21,8 +21,8 @@ from iif_core.numerics.xp import NUMPY
 from tests.errors import named
 from tests.oracles.blender import require_bpy
 from workflow.artifacts.files import read_exr, sha256_of, write_exr
+from workflow.decisions.held import measured
 from workflow.exporters import camera_files
-from workflow.exporters.held import measured
 from workflow.exporters.object_table import csv_bytes, hex_colour, object_rows, read_csv
 from workflow.scene.normal_form import View
 from workflow.scene.picture_facts import view_attributes

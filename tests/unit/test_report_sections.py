@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from workflow.exporters import held
+from workflow.decisions import held
 from workflow.report import scores, views
 from workflow.report.emitters import emitter_note, emitter_rows
 from workflow.report.evidence import roughness_interval, unfitted_share

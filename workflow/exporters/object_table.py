@@ -13,7 +13,7 @@ from iif_core.fitting.intervals import AlbedoIntervals, MeasuredErrors, Metallic
 from iif_core.fitting.problem import Kinds
 from iif_core.numerics import color
 from workflow.artifacts.store import StageReader
-from workflow.exporters.held import FILE, measured
+from workflow.decisions.held import FILE, measured
 from workflow.scene.recovered import Recovered
 
 Array = np.ndarray

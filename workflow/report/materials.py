@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from iif_core.numerics import color
-from workflow.exporters import held
+from workflow.decisions import held
 from workflow.report.wording import fit_words
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from workflow.exporters import held
+from workflow.decisions import held
 from workflow.report.wording import percent
 
 GREEN, AMBER, RED = "green", "amber", "red"
