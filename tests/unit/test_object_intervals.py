@@ -125,6 +125,15 @@ def test_relative_errors_add_up_in_squares():
     assert np.log(high[0] / 0.3) == pytest.approx(expected, rel=1e-3) == np.log(0.3 / low[0])
 
 
+def test_freedom_is_that_of_the_errors_at_the_albedo():
+    """In the dark the additive error, which is normal, prevails over that of the level, which has four degrees of freedom."""
+    errors = MeasuredErrors(0.02, 1e-6, 1e-6, 1.0, 1.0, 1.0)
+    for value in (0.02, 0.1, 0.5):
+        own = AlbedoIntervals.of([[value] * 3], [0.1], [1e12], 0.0, kinds(), errors)
+        freedom = pooled([(0.1 * value) ** 2, 0.02**2], [4.0, np.inf])[1]
+        assert own.above[0] == pytest.approx([student_width(freedom)] * 3, rel=1e-6), value
+
+
 def test_factor_widens_on_the_scale():
     low, high = albedo(0.3, factor=2.0)
     assert np.log(high[0] / low[0]) == pytest.approx(4 * 0.1 * Q4, rel=1e-4)
