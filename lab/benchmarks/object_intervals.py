@@ -52,6 +52,12 @@ COLUMNS = (
 )  # fmt: skip
 DARK, FEW = 0.1, 500
 """Objects of a lower albedo or of fewer pixels do not tell the error of hue: the additive error and borders hide it there."""
+HELD = {
+    "albedo": ("albedo", "albedo_width"),
+    "roughness": ("roughness_of_claimed", "roughness_width_of_claimed"),
+    "metallic": ("metallic", "metallic_width"),
+}
+"""What the product says of each quantity: of roughness, about the objects whose interval is narrower than 0 to 1."""
 SIGMA = 0.6827
 """Share of a normal distribution within one standard deviation."""
 Array = np.ndarray
@@ -300,10 +306,10 @@ def _summary(found: Sequence[Mapping[str, float]]) -> list[str]:
 def document(rooms: Sequence[Room], found: Sequence[Mapping[str, float]], errors: MeasuredErrors) -> dict[str, Any]:
     """Return what the product reads."""
     held = {}
-    for name in ("albedo", "roughness", "metallic"):
-        shares = [row[name] for row in found]
+    for name, (share, width) in HELD.items():
+        shares = [row[share] for row in found if np.isfinite(row[share])]
         held[name] = {"pooled": float(np.mean(shares)), "lowest": min(shares), "highest": max(shares)}
-        held[name]["half_width"] = float(np.mean([row[f"{name}_width"] for row in found]))
+        held[name]["half_width"] = float(np.nanmean([row[width] for row in found]))
     numbers = {name: float(f"{value:.4g}") for name, value in vars(errors).items()}
     held = {name: {key: round(value, 4) for key, value in entry.items()} for name, entry in held.items()}
     return {"errors": numbers, "held": held, "rooms": [room.scene for room in rooms]}
@@ -313,7 +319,7 @@ def tables(rooms: Sequence[Room], found: Sequence[Mapping[str, float]], errors: 
     """Return the tables of the page."""
     from workflow.report.blocks import markdown
 
-    shares = ("albedo", "brightness", "roughness", "metallic")
+    shares = ("albedo", "brightness", "roughness_of_claimed", "metallic")
     rows = []
     for room, row in zip(rooms, found, strict=True):
         level = f"{room.level_error:+.2f} ± {student_width(np.inf) * room.room_error:.2f}"
@@ -322,21 +328,38 @@ def tables(rooms: Sequence[Room], found: Sequence[Mapping[str, float]], errors: 
     inside = f"{sum(row['level'] for row in found):.0f} of {len(found)} inside"
     objects = f"{sum(row['objects'] for row in found):.0f}"
     rows.append(["**mean of the rooms**", objects, *(_percent(means[name]) for name in shares), inside, *_widths(means)])
-    weight = [row["objects"] for row in found]
-    pooled = [_percent(np.average([row[name] for row in found], weights=weight)) for name in shares]
+    pooled = []
+    for name in shares:
+        value = np.array([row[name] for row in found])
+        weight = np.array([row["objects"] * (row["roughness_claimed"] if name.startswith("roughness") else 1.0) for row in found])
+        pooled.append(_percent(np.average(np.nan_to_num(value), weights=weight)))
     rows.append(["**all objects**", objects, *pooled, *[""] * 5])
-    heads = ["room", "objects", "R, G, B", "brightness", "roughness", "metallic", "level of the room, error ± half of 95 %"]
-    heads += ["half width: R, G, B", "relative, of the surface", "roughness, where claimed", "roughness claimed of"]
+    heads = [
+        "room",
+        "objects",
+        "R, G, B",
+        "brightness",
+        "roughness, where claimed",
+        "metallic",
+        "level of the room, error ± half of 95 %",
+    ]
+    heads += ["half width: R, G, B", "relative, of the surface", "roughness", "roughness claimed of"]
     metals = sum(row["metals"] for row in found)
     held = sum(row["metals"] * np.nan_to_num(row["metals_held"]) for row in found)
     numbers = [[name, f"{value:.3g}"] for name, value in vars(errors).items()]
     numbers += [["true metals that their interval holds", f"{held:.0f} of {metals:.0f}"]]
-    numbers += [["held, where an interval of roughness is claimed", _percent(means["roughness_of_claimed"])]]
+    level = [room.level_error for room in rooms]
+    numbers += [["level of the room: mean error, and root mean square in claimed errors", _level(level, rooms)]]
     return {
         "intervals": "\n".join(markdown(heads, rows)),
         "terms": "\n".join(markdown(["with", "R, G, B held", "in a room", "half width, relative, of the surface"], terms(rooms))),
         "constants": "\n".join(markdown(["number", "value"], numbers)),
     }
+
+
+def _level(errors: Sequence[float], rooms: Sequence[Room]) -> str:
+    ratio = np.array(errors) / [room.room_error for room in rooms]
+    return f"{np.mean(errors):+.2f}, {np.sqrt(np.mean(ratio**2)):.1f}"
 
 
 def _widths(row: Mapping[str, float]) -> list[str]:
@@ -346,7 +369,7 @@ def _widths(row: Mapping[str, float]) -> list[str]:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %"
+    return f"{100 * share:.0f} %" if np.isfinite(share) else "-"
 
 
 def main() -> None:

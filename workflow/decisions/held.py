@@ -18,8 +18,8 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 @lru_cache(None)
 def measured() -> dict[str, Any]:
     """Return the document: `errors` (`iif_core.fitting.intervals.MeasuredErrors`), `rooms` from which they are, and of each
-    quantity in `held` the share of the objects whose truth an interval held that other rooms had made: `pooled`, and the `lowest`
-    and `highest` of a room."""
+    quantity in `held` the share of the objects whose truth an interval held that other rooms had made: the mean over rooms
+    (`pooled`), and the `lowest` and `highest`. Of roughness, objects with an interval of 0 to 1 do not count."""
     return json.loads(FILE.read_text())
 
 

@@ -36,5 +36,6 @@ def intervals_note() -> str:
     shares = [f"{name} of {held.words(name)}" for name in ("albedo", "roughness", "metallic")]
     return (
         "In brackets the 95 % interval, for albedo of its brightest channel; roughness that no photograph shows has 0 to 1."
-        f" In {held.rooms()} rooms with truth such intervals held the {', '.join(shares[:2])} and {shares[2]} of the objects."
+        f" In {held.rooms()} rooms with truth such intervals held the {', '.join(shares[:2])} and {shares[2]}"
+        " of the objects that they are claimed of."
     )
