@@ -44,15 +44,15 @@ class MeasuredErrors:
     """What rooms with truth say of the intervals.
 
     Attributes:
-        additive: error of an albedo that does not grow with it; hue: error of the logarithm of a channel relative to the
-            brightness; border: error of the logarithm of an albedo that one pixel shows, by what borders mix into it, which
-            falls with the root of the pixels. All are halves of central 68 % intervals.
+        additive: error of an albedo that does not grow with it; border: the same of an object that one pixel shows, by what its
+            borders mix into it, which falls with the root of the pixels; hue: error of the logarithm of a channel relative to
+            the brightness. All are halves of central 68 % intervals.
         albedo, roughness, metallic: the factor lambda of each.
     """
 
     additive: float
-    hue: float
     border: float
+    hue: float
     albedo: float
     roughness: float
     metallic: float
@@ -156,14 +156,14 @@ class AlbedoIntervals:
 
     Attributes:
         middle: (O, 3) on the scale; below, above: (O, 3) half widths, infinite where the albedo is not known.
-        relative: (O, 1) relative error, which bends the scale; additive: error of dark albedos.
+        relative, additive: (O, 1) errors that grow with the albedo and that do not, which bend the scale.
     """
 
     middle: NDArray
     below: NDArray
     above: NDArray
     relative: NDArray
-    additive: float
+    additive: NDArray
 
     @classmethod
     def of(
@@ -181,13 +181,13 @@ class AlbedoIntervals:
         a, level = np.asarray(albedo, np.float64), np.asarray(level, np.float64)
         known = (level > 0) & np.isfinite(level) & np.isfinite(room) & np.isfinite(a).all(1)
         a = np.where(known[:, None], np.clip(a, 0.0, 1.0), 0.5)
-        border = errors.border / np.sqrt(np.fmax(np.asarray(pixels, np.float64), 1.0))
-        parts = np.stack(np.broadcast_arrays(np.where(known, level, 1.0), room, errors.hue, border), 1)
+        parts = np.stack(np.broadcast_arrays(np.where(known, level, 1.0), room, errors.hue), 1)
         parts = np.minimum(np.nan_to_num(parts), _LARGEST) ** 2
         relative = np.clip(np.sqrt(parts.sum(1)), _SMALLEST, _LARGEST)[:, None]
-        additive = max(errors.additive, _SMALLEST)
-        every = np.concatenate([parts[:, None] * a[..., None] ** 2, np.full((*a.shape, 1), additive**2)], -1)
-        freedom = pooled(every, [_DEGREES_OF_FREEDOM, *[np.inf] * 4])[1][..., None]
+        border = errors.border / np.sqrt(np.fmax(np.asarray(pixels, np.float64), 1.0))
+        additive = np.maximum(np.hypot(errors.additive, border), _SMALLEST)[:, None]
+        every = np.concatenate([parts[:, None] * a[..., None] ** 2, np.broadcast_to(additive**2, a.shape)[..., None]], -1)
+        freedom = pooled(every, [_DEGREES_OF_FREEDOM, *[np.inf] * 3])[1][..., None]
         weight, shift = _mixture(kinds, kinds.brightness)
         own = cls(np.zeros_like(a), np.zeros_like(a), np.zeros_like(a), relative, additive)
         middle = own.scale(a)

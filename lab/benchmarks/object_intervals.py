@@ -58,6 +58,8 @@ HELD = {
     "metallic": ("metallic", "metallic_width"),
 }
 """What the product says of each quantity: of roughness, about the objects whose interval is narrower than 0 to 1."""
+SIZES = np.log([[1e-4, 0.3], [1e-3, 30.0]])
+"""Logarithms of the limits of the additive error and of that of borders."""
 SIGMA = 0.6827
 """Share of a normal distribution within one standard deviation."""
 Array = np.ndarray
@@ -195,8 +197,8 @@ def fitted(rooms: Sequence[Room]) -> MeasuredErrors:
     def unlikely(logs: Array) -> float:
         return -sum(_log_likelihood(room, hue, *np.exp(logs)) for room in rooms)
 
-    additive, border = np.exp(minimize(unlikely, np.log([0.01, 1.0]), method="Nelder-Mead").x)
-    errors = MeasuredErrors(float(additive), hue, float(border), 1.0, 1.0, 1.0)
+    additive, border = np.exp(minimize(unlikely, np.log([0.005, 0.4]), method="Nelder-Mead", bounds=SIZES).x)
+    errors = MeasuredErrors(float(additive), float(border), hue, 1.0, 1.0, 1.0)
     factors = {
         "albedo": _factor(rooms, lambda room: (own := room.albedo(errors)).residual(room.truth[:, :3])[np.isfinite(own.above)]),
         "roughness": _factor(rooms, lambda room: (own := room.roughness()).residual(room.truth[:, 3])[np.isfinite(own.above)]),
@@ -219,8 +221,8 @@ def _log_likelihood(room: Room, hue: float, additive: float, border: float) -> f
     """Mean log density of the true albedos: Student's t on the scale of Eq. M.58, times its slope 1 / sqrt((s a)^2 + delta^2)."""
     known = room.level > 0
     estimate, truth = room.estimate[known, :3], room.truth[known, :3]
-    relative = room.level[known] ** 2 + room.room_error**2 + hue**2 + border**2 / np.maximum(room.pixels[known], 1.0)
-    relative = np.sqrt(relative)[:, None]
+    relative = np.sqrt(room.level[known] ** 2 + room.room_error**2 + hue**2)[:, None]
+    additive = np.hypot(additive, border / np.sqrt(np.maximum(room.pixels[known], 1.0)))[:, None]
     away = np.diff([np.arcsinh(relative * a / additive) / relative for a in (estimate, truth)], axis=0)
     z = away * stdtrit(4.0, 0.5 + 0.5 * SIGMA)
     return float((-2.5 * np.log1p(z**2 / 4.0) - np.log(np.hypot(relative * truth, additive))).mean())

@@ -15,7 +15,7 @@ from iif_core.fitting.problem import Kinds
 from lab.benchmarks import object_intervals as measurement
 from workflow.decisions.held import FILE
 
-TRUE = MeasuredErrors(additive=0.01, hue=0.05, border=2.0, albedo=1.0, roughness=1.0, metallic=1.0)
+TRUE = MeasuredErrors(additive=0.01, border=0.4, hue=0.05, albedo=1.0, roughness=1.0, metallic=1.0)
 
 
 def room(seed: int, scale: float = 1.0, objects: int = 200) -> measurement.Room:
@@ -24,9 +24,8 @@ def room(seed: int, scale: float = 1.0, objects: int = 200) -> measurement.Room:
     truth = np.c_[rng.uniform(0.03, 0.7, (objects, 3)), rng.uniform(0.2, 0.8, objects), np.zeros(objects)]
     level, pixels = rng.uniform(0.03, 0.1, objects), 10 ** rng.uniform(2, 5, objects)
     of_level = level / stats.t.ppf(stats.norm.cdf(1), 4) * rng.standard_t(4, objects)
-    relative = of_level + TRUE.border * rng.normal(size=objects) / np.sqrt(pixels)
-    hue, additive = TRUE.hue * rng.normal(size=(objects, 3)), TRUE.additive * rng.normal(size=(objects, 3))
-    albedo = truth[:, :3] * np.exp(scale * (relative[:, None] + hue)) + scale * additive
+    hue, additive = TRUE.hue * rng.normal(size=(objects, 3)), np.hypot(TRUE.additive, TRUE.border / np.sqrt(pixels))
+    albedo = truth[:, :3] * np.exp(scale * (of_level[:, None] + hue)) + scale * additive[:, None] * rng.normal(size=(objects, 3))
     roughness = np.clip(truth[:, 3] + 0.08 * scale * rng.normal(size=objects), 0.02, 1)
     none = np.zeros((objects, 3))
     kinds = Kinds(none + [1.0, 0.0, 0.0], none, none + 0.5, none + 0.08, np.ones(objects))

@@ -113,14 +113,16 @@ def test_bright_albedo_has_a_factor_and_dark_albedo_an_offset():
     additive = MeasuredErrors(0.02, 1e-6, 1e-6, 1.0, 1.0, 1.0)
     low, high = albedo(0.0, errors=additive)  # the additive error alone, which is normal
     assert low[0] == 0.0 and high[0] == pytest.approx(0.02 * 1.959964, rel=0.01)
+    borders = MeasuredErrors(0.012, 0.32, 1e-6, 1.0, 1.0, 1.0)  # 0.32 / sqrt(400) = 0.016, and 0.02 with the additive error
+    assert albedo(0.0, pixels=400, errors=borders)[1][0] == pytest.approx(high[0], rel=1e-6)
     low, high = albedo(0.5, level=1e-9, errors=additive)
     assert (low[0], high[0]) == pytest.approx((0.5 - 0.02 * 1.959964, 0.5 + 0.02 * 1.959964), rel=1e-4)
 
 
 def test_relative_errors_add_up_in_squares():
-    """Level of the object 0.03, room 0.1, hue 0.05, and borders 2 / sqrt(400) = 0.1."""
-    low, high = albedo(0.3, level=0.03, room=0.1, pixels=400, errors=MeasuredErrors(1e-6, 0.05, 2.0, 1.0, 1.0, 1.0))
-    total, freedom = pooled(np.array([0.03, 0.1, 0.05, 0.1]) ** 2, [4.0, np.inf, np.inf, np.inf])
+    """Level of the object 0.03, room 0.1, hue 0.05."""
+    low, high = albedo(0.3, level=0.03, room=0.1, errors=MeasuredErrors(1e-6, 1e-6, 0.05, 1.0, 1.0, 1.0))
+    total, freedom = pooled(np.array([0.03, 0.1, 0.05]) ** 2, [4.0, np.inf, np.inf])
     expected = np.sqrt(total) * student_width(freedom)
     assert np.log(high[0] / 0.3) == pytest.approx(expected, rel=1e-3) == np.log(0.3 / low[0])
 
@@ -160,11 +162,12 @@ def test_what_is_not_known_lies_within_0_and_1(level, room, value):
 
 def test_stated_errors_of_the_model_are_held_as_often_as_claimed():
     rng = np.random.default_rng(2)
-    n, errors = 20_000, MeasuredErrors(0.01, 0.05, 1.0, 1.0, 1.0, 1.0)
+    n, errors = 20_000, MeasuredErrors(0.01, 0.4, 0.05, 1.0, 1.0, 1.0)
     truth, level, pixels = rng.uniform(0.02, 0.6, (n, 3)), rng.uniform(0.05, 0.1, n), rng.uniform(100, 1000, n)
     scale = 1.0 / stats.t.ppf(stats.norm.cdf(1), 4)
-    relative = level * scale * rng.standard_t(4, n) + 0.1 * rng.normal(size=n) + rng.normal(size=n) / np.sqrt(pixels)
-    found = truth * np.exp(relative[:, None] + 0.05 * rng.normal(size=(n, 3))) + 0.01 * rng.normal(size=(n, 3))
+    relative = level * scale * rng.standard_t(4, n) + 0.1 * rng.normal(size=n)
+    additive = np.hypot(0.01, 0.4 / np.sqrt(pixels))[:, None] * rng.normal(size=(n, 3))
+    found = truth * np.exp(relative[:, None] + 0.05 * rng.normal(size=(n, 3))) + additive
     low, high = AlbedoIntervals.of(found, level, pixels, 0.1, kinds(n), errors).ends(1.0)
     assert np.mean((low <= truth) & (truth <= high)) == pytest.approx(0.95, abs=0.01)
 
@@ -213,7 +216,7 @@ PROBABILITIES = st.tuples(ANY, ANY, ANY).map(lambda p: p if np.isfinite(p).all()
 @given(ANY, ANY, ANY, ANY, PROBABILITIES, st.floats(-50, 50), ANY, st.sampled_from([1e-3, 1.0, 1e3]))
 def test_intervals_are_within_0_and_1_whatever_is_known(value, level, pixels, room, probability, shift, deviation, factor):
     of = kinds(probability=probability, brightness=(0.0, shift, -shift), roughness=(value, value, value), deviation=deviation)
-    errors = MeasuredErrors(0.01, 0.05, 1.0, 1.0, 1.0, 1.0)
+    errors = MeasuredErrors(0.01, 0.4, 0.05, 1.0, 1.0, 1.0)
     with np.errstate(all="raise", under="ignore"):
         made = [
             AlbedoIntervals.of([[value] * 3], [level], [pixels], room, of, errors).ends(factor),
@@ -230,7 +233,7 @@ def test_an_interval_of_the_residual_just_reaches_the_truth(value, truth, level,
     of = kinds(
         probability=(1 - other, other, 0.0), brightness=(0.0, shift, 0.0), roughness=(value, 0.5, 0.5), deviation=level / 3
     )
-    errors = MeasuredErrors(0.01, 0.05, 1.0, 1.0, 1.0, 1.0)
+    errors = MeasuredErrors(0.01, 0.4, 0.05, 1.0, 1.0, 1.0)
     for own in (AlbedoIntervals.of([[value] * 3], [level], [100], 0.1, of, errors), RoughnessIntervals.of([value], of)):
         factor = float(np.max(own.residual([truth])))
         low, high = (float(np.ravel(end)[0]) for end in own.ends(max(factor, 1e-12)))
