@@ -144,12 +144,17 @@ class Kinds:
     deviation: np.ndarray
     seen: np.ndarray
 
+    @classmethod
+    def unknown(cls, n_objects: int) -> Kinds:
+        """Return that nothing is known of any object."""
+        return cls(*np.zeros((4, n_objects, 3)), np.zeros(n_objects))
+
     def among(self, members: np.ndarray, n_objects: int) -> Kinds:
-        """Return the same for all objects, of which these are the `members`; 0 for the others, of which nothing is known."""
-        out = {f.name: np.zeros((n_objects, *getattr(self, f.name).shape[1:])) for f in fields(self)}
-        for name, values in out.items():
-            values[members] = getattr(self, name)
-        return Kinds(**out)
+        """Return the same for all objects, of which these are the `members`; nothing is known of the others."""
+        out = Kinds.unknown(n_objects)
+        for f in fields(self):
+            getattr(out, f.name)[members] = getattr(self, f.name)
+        return out
 
 
 @dataclass(frozen=True, kw_only=True)
