@@ -32,7 +32,7 @@ from iif_core.fitting.population import (
     update_population,
     with_profiled_roughness,
 )
-from iif_core.fitting.problem import FitOptions, FitProblem, FitResult
+from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, Kinds
 from iif_core.fitting.selection import (
     EVIDENCE_DISCOUNT,
     KINDS,
@@ -77,6 +77,7 @@ class FitProgress:
         response_weight: (O,) weight q of each object's pixels (Eq. M.25); None: 1.
         levels: both estimates of the level of each object, once they were compared.
         given: (O, 2) roughness and metallic that are known and stay, NaN = fitted; None: all are fitted.
+        kinds: what the selection left open; None: nothing was selected.
     """
 
     state: DescentState
@@ -87,6 +88,7 @@ class FitProgress:
     response_weight: np.ndarray | None = None
     levels: ObjectLevels | None = None
     given: np.ndarray | None = None
+    kinds: Kinds | None = None
 
 
 def fit_affines(problem: FitProblem, response: Response, options: FitOptions | None = None) -> FitResult:
@@ -273,7 +275,7 @@ def _select_kinds(
     state = DescentState(affine, free, state.params, np.full(px.n_objects, 1e-3))
     profiled = _profile_errors(few, state, prior, tone, opt, found.noise, choice)
     weight = np.maximum(choice.allowed_share, LEAST_RESPONSE_WEIGHT)
-    fit = replace(fit, state=state, metallic=metallic, profiled=profiled, response_weight=weight)
+    fit = replace(fit, state=state, metallic=metallic, profiled=profiled, response_weight=weight, kinds=choice.kinds)
     if opt.population:
         fit = replace(fit, population=initial_population(*choice.population))
         return replace(fit, prior=_make_prior(fit, noise, texture.mean[:, 3]))
@@ -396,6 +398,7 @@ def result_of(
         errors[px.saturated] = 0.0
         square = px.sum_by_object((np.minimum(np.abs(errors), 1e6) ** 2).sum(1))
         residual[members] = np.sqrt(square / np.maximum(px.sum_by_object((~px.saturated).sum(1)), 1))
+    kinds = None if fit.kinds is None else fit.kinds.among(members, n_objects)
     light_gain = np.ones(n_objects)
     if fit.levels is not None:
         light_gain[members] = fit.levels.light_gain
@@ -420,6 +423,7 @@ def result_of(
         reason=state.reason or "nothing to fit",
         facts=facts,
         light_gain=light_gain,
+        kinds=kinds,
     )
 
 

@@ -5,7 +5,7 @@ The sixteen numbers of an object are ordered as in `iif_core.reflectance.materia
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
 import numpy as np
@@ -127,6 +127,36 @@ class FitOptions:
     threads: int = 1
 
 
+@dataclass(frozen=True)
+class Kinds:
+    """What the evidence leaves open of each object: its kind, and what would go with another one.
+
+    Attributes:
+        probability: (O, 3) posterior of the rows of `selection.KINDS`.
+        brightness: (O, 3) logarithm of the brightness of the albedo fitted to each kind, over that of the chosen one.
+        roughness, deviation: (O, 3) posterior mean and standard deviation given each kind.
+        seen: (O,) 1 - (variance of the roughness given the chosen kind) / (the same without the photographs), at least 0.
+    """
+
+    probability: np.ndarray
+    brightness: np.ndarray
+    roughness: np.ndarray
+    deviation: np.ndarray
+    seen: np.ndarray
+
+    @classmethod
+    def unknown(cls, n_objects: int) -> Kinds:
+        """Return that nothing is known of any object."""
+        return cls(*np.zeros((4, n_objects, 3)), np.zeros(n_objects))
+
+    def among(self, members: np.ndarray, n_objects: int) -> Kinds:
+        """Return the same for all objects, of which these are the `members`; nothing is known of the others."""
+        out = Kinds.unknown(n_objects)
+        for f in fields(self):
+            getattr(out, f.name)[members] = getattr(self, f.name)
+        return out
+
+
 @dataclass(frozen=True, kw_only=True)
 class FitResult:
     """Result of a solver.
@@ -148,6 +178,7 @@ class FitResult:
         iterations: steps of the last descent; reason: why it ended.
         facts: further numbers for `affines.json`.
         light_gain: (O,) factor by which the light on each object is believed to be brighter than computed (Eq. M.36); None: 1.
+        kinds: what the selection left open; None: nothing was selected.
     """
 
     affine: np.ndarray
@@ -165,6 +196,7 @@ class FitResult:
     reason: str = ""
     facts: dict[str, Any] = field(default_factory=dict)
     light_gain: np.ndarray | None = None
+    kinds: Kinds | None = None
 
 
 def albedo_uncertainty(

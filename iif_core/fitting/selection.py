@@ -11,7 +11,7 @@ import numpy as np
 from iif_core.fitting.descent import DescentState, GaussianPrior, decompose
 from iif_core.fitting.pixels import Pixels, Terms, evaluate, penalties_of, run_in_threads
 from iif_core.fitting.predictions import DEGREES_OF_FREEDOM, PredictionErrors
-from iif_core.fitting.problem import FitOptions
+from iif_core.fitting.problem import FitOptions, Kinds
 from iif_core.fitting.profile_kernels import AlbedoTask, fit_albedo
 from iif_core.fitting.tone import Tone
 from iif_core.reflectance.material import BIASES, CROSS_TERMS, GAINS, IDENTITY, METALLIC, NUMBERS, ROUGHNESS
@@ -219,7 +219,7 @@ class Choice:
     """Posterior of the profile (Eq. M.24).
 
     Attributes:
-        kind: (O,) int, row of `KINDS`; probability: (O, 3) of the kinds.
+        kind: (O,) int, row of `KINDS`; kinds: posterior of all of them.
         roughness, deviation: (O,) posterior mean and standard deviation given the kind; at: (O,) nearest index in
             `ROUGHNESS_GRID`.
         population: mean and standard deviation of the roughness over the objects.
@@ -227,7 +227,7 @@ class Choice:
     """
 
     kind: np.ndarray
-    probability: np.ndarray
+    kinds: Kinds
     roughness: np.ndarray
     deviation: np.ndarray
     at: np.ndarray
@@ -295,16 +295,24 @@ def choose_kinds(
 
     # -------- kind of each object, and its roughness given that kind (Eq. M.24) --------
     probability = posterior.sum(2)
-    kind = probability.argmax(1)
-    # From here on `given` is no longer the argument: it is the posterior of the roughness given the kind, (O, R).
-    given = posterior[np.arange(len(kind)), kind]
-    given = given / np.maximum(given.sum(1, keepdims=True), 1e-300)
-    mean = given @ ROUGHNESS_GRID
-    deviation = np.sqrt(np.maximum(given @ ROUGHNESS_GRID**2 - mean**2, 0.0))
+    kind, each = probability.argmax(1), np.arange(len(counts))
+    mean, deviation = _moments(posterior)
+    _, unseen = _moments(prior * of_base[:, None])
+    log_ratio = (posterior * brightness).sum(2) / np.maximum(probability, 1e-300)
+    informed = 1.0 - (deviation / np.maximum(unseen, 1e-6))[each, kind] ** 2
+    kinds = Kinds(probability, log_ratio - log_ratio[each, kind][:, None], mean, deviation, np.maximum(informed, 0.0))
+    mean, deviation = mean[each, kind], deviation[each, kind]
     at = np.abs(ROUGHNESS_GRID[None] - mean[:, None]).argmin(1)
     level = float(histogram.sum(0) @ ROUGHNESS_GRID)
     width = float(np.sqrt(max(histogram.sum(0) @ ROUGHNESS_GRID**2 - level**2, 0.0)))
-    return Choice(kind, probability, mean, deviation, at, (level, width), np.where(counts, allowed_share, 1.0))
+    return Choice(kind, kinds, mean, deviation, at, (level, width), np.where(counts, allowed_share, 1.0))
+
+
+def _moments(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and standard deviation of the roughness under weights (..., R) of `ROUGHNESS_GRID`."""
+    weight = weight / np.maximum(weight.sum(-1, keepdims=True), 1e-300)
+    mean = weight @ ROUGHNESS_GRID
+    return mean, np.sqrt(np.maximum(weight @ ROUGHNESS_GRID**2 - mean**2, 0.0))
 
 
 def _within_given(cost: np.ndarray, tried: np.ndarray, given: np.ndarray) -> np.ndarray:

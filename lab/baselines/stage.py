@@ -14,6 +14,7 @@ import numpy as np
 from iif_core.camera.pixels import pixel_gains
 from iif_core.camera.response import Response, response, response_facts, response_from_facts
 from iif_core.fitting.cell_pixels import AlbedoSums, PixelRows
+from iif_core.fitting.problem import Kinds
 from iif_core.light.base_scene import BaseScene
 from iif_core.reflectance.material import CHANNELS, IDENTITY, NEUTRAL, NUMBERS_OF
 from lab.baselines.adam import solve_adam
@@ -23,6 +24,7 @@ from lab.baselines.loss import FIPT, IRIS, CellFit, albedo_deviation, fill_unkno
 from lab.baselines.problem import CellSums
 from lab.baselines.texture import blocks_of, cell_albedo
 from workflow.artifacts.store import ids_from_disk, split_rgb
+from workflow.fitting.affine_files import kind_columns
 from workflow.fitting.cell_pixels import CellPixels
 from workflow.fitting.inputs import cells_of, roughness_levels
 from workflow.runtime.job import Job
@@ -236,6 +238,7 @@ def _write_objects(job: Job, scene: BaseScene, result: _Result, model: str) -> N
         columns[f"T_{name}"], columns[f"std_{name}"] = affine[:, part], np.zeros_like(affine[:, part])
     zeros = np.zeros(len(names))
     columns |= {"std_level": zeros, "covariance_trace": zeros, "residual": zeros, "light_gain": 1.0 + zeros}
+    columns |= kind_columns(Kinds.unknown(len(names)))
     columns["model"] = np.array([MODEL_NAMES[model]] * len(names), dtype=str)
     columns["given"] = np.array([""] * len(names), dtype=str)  # `materials` needs the model of objects
     job.writer.table("objects.parquet", columns, {"residual": "sensor value"})

@@ -1,104 +1,401 @@
-"""Whether the 95 % intervals of `objects.csv` hold the truth.
+"""Whether the 95 % intervals of `objects.csv` hold the truth, and the numbers from which they are made.
 
-    python lab/benchmarks/object_intervals.py kitchen modern-hall country-kitchen [--quality draft] [--pixels 100]
+    python lab/benchmarks/object_intervals.py --make sky lamps [--variant small]       photograph rooms, fit, measure
+    python lab/benchmarks/object_intervals.py kitchen modern-hall [--quality draft]    measure scenes that are finished
+    python lab/benchmarks/object_intervals.py                                          the constants and tables alone
 
-Run it in a working folder where the scenes, which need a truth, are finished. The truth of an object is the mean of the true map
-over all its pixels that count in stage `metrics`; objects with fewer pixels, or without an interval, are left out. Rows are
-kept in lab/notebook/data/object_intervals.json, and the table of lab/notebook/intervals.md is made anew.
+Run it in a working folder. `--make` takes any scenes of lab/config/studies/scenes.yaml, under the settings of a variant of study
+`intervals`, up to stage affines, one after the other. The rows of each room, one for each object, replace those that it had in
+lab/notebook/data/object_intervals.csv as soon as it is finished. Of all rooms there, the command then writes
+workflow/decisions/intervals.json, which the product reads, and the tables of lab/notebook/intervals.md. Truth and estimate of
+an object are means over its surface cells, which have equal areas; truth is known where photographs show it, and objects with
+fewer such cells than `--cells` are left out.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
+import subprocess
 import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
+from scipy.optimize import minimize
+from scipy.special import stdtrit
 
 import lab  # noqa: F401  for the sources of the laboratory
+from iif_core.errors import InputError
+from iif_core.fitting.intervals import (
+    AlbedoIntervals,
+    MeasuredErrors,
+    MetallicIntervals,
+    RoughnessIntervals,
+    conformal_factor,
+    student_width,
+)
+from iif_core.fitting.problem import Kinds
+from iif_core.reflectance.material import CHANNELS
+from workflow.decisions.held import FILE
 
-ROWS, PAGE = Path("lab/notebook/data/object_intervals.json"), Path("lab/notebook/intervals.md")
+REPOSITORY = Path(__file__).resolve().parents[2]
+ROWS, PAGE = REPOSITORY / "lab/notebook/data/object_intervals.csv", REPOSITORY / "lab/notebook/intervals.md"
+KINDS = ("probability", "brightness", "roughness", "deviation")
+COLUMNS = (
+    "scene", "object", "cells", "pixels", "room_error", "level", "seen",
+    *CHANNELS, *(f"true_{name}" for name in CHANNELS), *(f"{name}_{k}" for name in KINDS for k in range(3)),
+)  # fmt: skip
+DARK, FEW = 0.1, 500
+"""Objects of a lower albedo or of fewer pixels do not tell the error of hue: the additive error and borders hide it there."""
+HELD = {
+    "albedo": ("albedo", "albedo_width"),
+    "roughness": ("roughness_of_claimed", "roughness_width_of_claimed"),
+    "metallic": ("metallic", "metallic_width"),
+}
+"""What the product says of each quantity: of roughness, about the objects whose interval is narrower than 0 to 1."""
+SIZES = np.log([[1e-4, 0.3], [1e-3, 30.0]])
+"""Logarithms of the limits of the additive error and of that of borders."""
+SIGMA = 0.6827
+"""Share of a normal distribution within one standard deviation."""
+Array = np.ndarray
 
 
-def truths(job: Any) -> dict[str, dict[int, tuple[int, np.ndarray]]]:
-    """Quantity -> object -> number of pixels and mean of the true map."""
-    from workflow.scene.normal_form import CaptureReader
-    from workflow.scoring.scores import material_truth
+@dataclass(frozen=True)
+class Room:
+    """Objects of a room: estimates and truths (O, 5) of `CHANNELS`, errors (O,) of their levels, error of the room's level, cells
+    (O,) whose truth is known, pixels (O,) of the fit, and what it left open of kinds."""
 
-    capture, segmentation = CaptureReader(job.read("capture")), job.read("segmentation")
-    sums: dict[str, dict[int, list[Any]]] = {"albedo": {}, "roughness": {}}
-    for view in capture.views:
-        truth = material_truth(capture, segmentation, view)
-        for quantity, found in sums.items():
-            mask = truth.masks[quantity] & (truth.object_id >= 0)
-            values, owner = truth.targets[quantity].truth[mask].reshape(mask.sum(), -1), truth.object_id[mask]
-            for number in np.unique(owner).tolist():
-                own = owner == number
-                entry = found.setdefault(number, [0, 0.0])
-                entry[0] += int(own.sum())
-                entry[1] = entry[1] + values[own].sum(0, dtype=np.float64)
-    return {q: {o: (count, total / count) for o, (count, total) in found.items()} for q, found in sums.items()}
+    scene: str
+    estimate: Array
+    truth: Array
+    level: Array
+    room_error: float
+    cells: Array
+    pixels: Array
+    kinds: Kinds
+
+    @property
+    def name(self) -> str:
+        """Of the room, without study, variant and seed."""
+        return self.scene.partition("--")[0]
+
+    def albedo(self, errors: MeasuredErrors) -> AlbedoIntervals:
+        return AlbedoIntervals.of(self.estimate[:, :3], self.level, self.pixels, self.room_error, self.kinds, errors)
+
+    def roughness(self) -> RoughnessIntervals:
+        return RoughnessIntervals.of(self.estimate[:, 3], self.kinds)
+
+    def metallic(self) -> MetallicIntervals:
+        return MetallicIntervals.of(self.estimate[:, 4], self.kinds)
+
+    @property
+    def level_error(self) -> float:
+        """Logarithm of the estimated over the true level of the room: median over its surface."""
+        ratio = np.log(np.maximum(self.estimate[:, :3].mean(1), 1e-3) / np.maximum(self.truth[:, :3].mean(1), 1e-3))
+        return _middle(ratio, self.cells)
 
 
-def measured(scene: str, quality: str, pixels: int) -> dict[str, Any]:
-    """The row of one scene."""
-    from workflow.exporters.object_table import read_csv
+def _middle(values: Array, weight: Array, share: float = 0.5) -> float:
+    """Return the weighted median, or another quantile."""
+    order = np.argsort(values)
+    return float(values[order][np.searchsorted(np.cumsum(weight[order]), share * weight.sum())])
+
+
+# ------------------------------------------------------------------------------------------------------------ measuring
+
+
+def make(scene: str) -> None:
+    """Run the stages of a scene up to the fit."""
+    target = f"results/{scene}/affines/manifest.json"
+    program = Path(sys.executable).with_name("snakemake")
+    subprocess.run([program, "-s", REPOSITORY / "lab/Snakefile", "--cores", "1", target], check=True)
+
+
+def measured(scene: str, quality: str, cells: int) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a scene whose fit is finished."""
+    from workflow.exporters.object_table import kinds_of
     from workflow.runtime.job import Job
+    from workflow.scene.base_scene import read_base
+    from workflow.scene.normal_form import CaptureReader
+    from workflow.scoring.scores import cell_truth
 
-    job = Job("publish", scene, quality, 1)
-    rows = read_csv(job.read("export").path("objects.csv").read_bytes())
-    true = truths(job)
-    inside: dict[str, list[bool]] = {"albedo": [], "channels": [], "roughness": []}
-    errors, widths = [], []
-    for row in rows:
-        number = int(row["object_id"])
-        count, mean = true["albedo"].get(number, (0, None))
-        if count >= pixels and row["base_colour_r_low"]:
-            value, low, high = (np.array([float(row[f"base_colour_{c}{end}"]) for c in "rgb"]) for end in ("", "_low", "_high"))
-            inside["channels"] += ((low <= mean) & (mean <= high)).tolist()
-            wide = float(np.log(value.max() / low[value.argmax()]))  # of the level, which all channels share
-            errors.append(abs(float(np.log(mean.mean() / value.mean()))))
-            widths.append(wide)
-            inside["albedo"].append(errors[-1] <= wide)
-        count, mean = true["roughness"].get(number, (0, None))
-        if count >= pixels and row["roughness_low"]:
-            inside["roughness"].append(float(row["roughness_low"]) <= mean[0] <= float(row["roughness_high"]))
-    shares = {f"{name}_inside": float(np.mean(found)) for name, found in inside.items()}
-    numbers = {"objects": len(errors), "with_roughness": len(inside["roughness"])}
-    quantiles = {f"error_{round(100 * q)}": float(np.quantile(errors, q)) for q in (0.5, 0.9)}
-    return {"scene": scene} | numbers | shares | quantiles | {"half_width": float(np.median(widths))}
+    job = Job("export", scene, quality, 1)
+    base, fitted = read_base(job), job.read("affines")
+    own, objects = base.table("cells.parquet")["object_id"], fitted.table("objects.parquet")
+    found = fitted.table("cells.parquet", CHANNELS)
+    estimate = np.stack([found[name] for name in CHANNELS], 1)
+    of_cells = cell_truth(CaptureReader(job.read("capture")), job.read("segmentation"), base)
+    truth = np.concatenate([of_cells[quantity] for quantity in ("albedo", "roughness", "metallic")], 1)
+    known, n = np.isfinite(truth).all(1), len(objects["object_id"])
+    count = np.bincount(own[known], minlength=n)[:n]
+    estimates, truths = _means(estimate, own, n), _means(truth[known], own[known], n)
+    kinds = kinds_of(objects, n)
+    room_error = fitted.json("affines.json")["scale"]["relative_error"]
+    for o in np.flatnonzero(count >= cells):
+        facts = {"scene": scene, "object": int(o), "cells": int(count[o]), "pixels": int(objects["pixels"][o])}
+        facts |= {"room_error": room_error, "level": objects["std_level"][o], "seen": kinds.seen[o]}
+        facts |= dict(zip(CHANNELS, estimates[o], strict=True))
+        facts |= {f"true_{name}": value for name, value in zip(CHANNELS, truths[o], strict=True)}
+        facts |= {f"{name}_{k}": getattr(kinds, name)[o, k] for name in KINDS for k in range(3)}
+        yield {key: f"{value:.5g}" if isinstance(value, float | np.floating) else value for key, value in facts.items()}
+
+
+def _means(values: Array, owner: Array, n: int) -> Array:
+    count = np.maximum(np.bincount(owner, minlength=n)[:n], 1)
+    return np.stack([np.bincount(owner, column.astype(np.float64), n)[:n] for column in values.T], 1) / count[:, None]
+
+
+def keep(scene: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Replace the rows of a scene in the table."""
+    others = [row for row in _table() if row["scene"] != scene]
+    every = sorted([*others, *rows], key=lambda row: (row["scene"], int(row["object"])))
+    with ROWS.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(every)
+
+
+def _table() -> list[dict[str, str]]:
+    if not ROWS.is_file():
+        return []
+    with ROWS.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def rooms_of(table: Sequence[Mapping[str, str]]) -> list[Room]:
+    """Return the rooms of the table."""
+    rooms = []
+    for scene in sorted({row["scene"] for row in table}):
+        own = [row for row in table if row["scene"] == scene]
+
+        def columns(*names: str, own: Sequence[Mapping[str, str]] = own) -> Array:
+            return np.array([[float(row[name]) for name in names] for row in own])
+
+        kinds = Kinds(**{name: columns(*(f"{name}_{k}" for k in range(3))) for name in KINDS}, seen=columns("seen")[:, 0])
+        truth = columns(*(f"true_{name}" for name in CHANNELS))
+        level, room_error, *counts = columns("level", "room_error", "cells", "pixels").T
+        rooms.append(Room(scene, columns(*CHANNELS), truth, level, float(room_error[0]), *counts, kinds))
+    return rooms
+
+
+# ---------------------------------------------------------------------------------------------- errors, factors, coverage
+
+
+def fitted(rooms: Sequence[Room]) -> MeasuredErrors:
+    """Measure the error of hue, the most likely additive error and error of borders, and the factors. Every room weighs the same.
+
+    Raises:
+        InputError: there are too few objects for a factor.
+    """
+    hue = _middle(*_weighted([_away_in_hue(room) for room in rooms]), SIGMA)
+
+    def unlikely(logs: Array) -> float:
+        return -sum(_log_likelihood(room, hue, *np.exp(logs)) for room in rooms)
+
+    additive, border = np.exp(minimize(unlikely, np.log([0.005, 0.4]), method="Nelder-Mead", bounds=SIZES).x)
+    errors = MeasuredErrors(float(additive), float(border), hue, 1.0, 1.0, 1.0)
+    factors = {
+        "albedo": _factor(rooms, lambda room: (own := room.albedo(errors)).residual(room.truth[:, :3])[np.isfinite(own.above)]),
+        "roughness": _factor(rooms, lambda room: (own := room.roughness()).residual(room.truth[:, 3])[np.isfinite(own.above)]),
+        # Below 1 the evidence for a kind would count for more than the fit itself takes it for.
+        "metallic": max(1.0, _factor(rooms, lambda room: room.metallic().residual(room.truth[:, 4]))),
+    }
+    if not np.isfinite(list(factors.values())).all():
+        raise InputError(f"object_intervals: {factors} from {len(rooms)} rooms; measure more rooms (--make)")
+    return replace(errors, **factors)
+
+
+def _away_in_hue(room: Room) -> Array:
+    use = (room.estimate[:, :3].mean(1) >= DARK) & (room.pixels >= FEW)
+    ratio = np.log(np.maximum(room.estimate[use, :3], 1e-3) / np.maximum(room.truth[use, :3], 1e-3))
+    brightness = np.log(room.estimate[use, :3].mean(1) / np.maximum(room.truth[use, :3].mean(1), 1e-3))
+    return np.abs(ratio - brightness[:, None]).ravel()
+
+
+def _log_likelihood(room: Room, hue: float, additive: float, border: float) -> float:
+    """Mean log density of the true albedos: Student's t on the scale of Eq. M.58, times its slope 1 / sqrt((s a)^2 + delta^2)."""
+    known = room.level > 0
+    estimate, truth = room.estimate[known, :3], room.truth[known, :3]
+    relative = np.sqrt(room.level[known] ** 2 + room.room_error**2 + hue**2)[:, None]
+    additive = np.hypot(additive, border / np.sqrt(np.maximum(room.pixels[known], 1.0)))[:, None]
+    away = np.diff([np.arcsinh(relative * a / additive) / relative for a in (estimate, truth)], axis=0)
+    z = away * stdtrit(4.0, 0.5 + 0.5 * SIGMA)
+    return float((-2.5 * np.log1p(z**2 / 4.0) - np.log(np.hypot(relative * truth, additive))).mean())
+
+
+def _factor(rooms: Sequence[Room], residual: Callable[[Room], Array]) -> float:
+    return conformal_factor(*_weighted([np.ravel(residual(room)) for room in rooms]))
+
+
+def _weighted(found: Sequence[Array]) -> tuple[Array, Array]:
+    """Join the values of rooms, with weights that add up to 1 in each."""
+    return np.concatenate(found), np.concatenate([np.full(len(values), 1.0 / max(len(values), 1)) for values in found])
+
+
+def coverage(room: Room, errors: MeasuredErrors) -> dict[str, float]:
+    """Return shares of held truths, half widths (medians over the objects, the relative one over the surface), and how much is
+    claimed, of a room under errors of others."""
+    low, high = room.albedo(errors).ends(errors.albedo)
+    truth, middle = room.truth, room.estimate[:, :3].mean(1)
+    out = {
+        "objects": float(len(truth)),
+        "albedo": float(((low <= truth[:, :3]) & (truth[:, :3] <= high)).mean()),
+        "brightness": float(((low.mean(1) <= truth[:, :3].mean(1)) & (truth[:, :3].mean(1) <= high.mean(1))).mean()),
+        "albedo_width": float(np.median(0.5 * (high - low))),
+        "relative_width": _middle(0.5 * (high - low).mean(1) / np.maximum(middle, 1e-3), room.cells),
+        "level": float(abs(room.level_error) <= student_width(np.inf) * room.room_error),
+    }
+    for name, own, column in (("roughness", room.roughness(), 3), ("metallic", room.metallic(), 4)):
+        low, high = own.ends(getattr(errors, name))
+        inside, claimed = (low <= truth[:, column]) & (truth[:, column] <= high), high - low < 0.999
+        out |= {name: float(inside.mean()), f"{name}_width": float(np.median(0.5 * (high - low)))}
+        out |= {f"{name}_claimed": float(claimed.mean()), f"{name}_of_claimed": _mean(inside[claimed])}
+        out |= {f"{name}_width_of_claimed": float(np.median(0.5 * (high - low)[claimed])) if claimed.any() else np.nan}
+    metal = truth[:, 4] > 0.5
+    out["metals"] = float(metal.sum())
+    out["metals_held"] = _mean(inside[metal])
+    return out
+
+
+def _mean(values: Array) -> float:
+    return float(values.mean()) if len(values) else np.nan
+
+
+def left_out(rooms: Sequence[Room]) -> list[dict[str, float]]:
+    """Return the coverage of each room under what all rooms of other names say."""
+    return [coverage(room, fitted([other for other in rooms if other.name != room.name])) for room in rooms]
+
+
+def terms(rooms: Sequence[Room]) -> list[list[str]]:
+    """Return what each term adds to the intervals of albedo: shares of channels held and half widths, means over the rooms."""
+    everything = fitted(rooms)
+    none = replace(everything, additive=1e-6, hue=1e-6, border=1e-6)
+    normal = float(student_width(np.inf) / student_width(4.0))
+
+    def without(room: Room, level: bool = True) -> Room:
+        kinds = replace(room.kinds, probability=np.zeros_like(room.kinds.probability))
+        return replace(room, kinds=kinds, room_error=room.room_error if level else 0.0)
+
+    steps: list[tuple[str, Callable[[Room], Room], MeasuredErrors, float]] = [
+        ("error of the object's level, times 1.96", lambda room: without(room, False), none, normal),
+        ("Student's t of four degrees of freedom", lambda room: without(room, False), none, 1.0),
+        ("error of the room's level", without, none, 1.0),
+        ("error of hue", without, replace(none, hue=everything.hue), 1.0),
+        ("additive error", without, replace(everything, border=1e-6), 1.0),
+        ("error of borders", without, everything, 1.0),
+        ("other kinds", lambda room: room, everything, 1.0),
+    ]
+    out = []
+    for name, change, errors, factor in steps:
+        found = [coverage(change(room), replace(errors, albedo=factor)) for room in rooms]
+        out.append([name, *_summary(found)])
+    return [*out, ["the factor, from the other rooms", *_summary(left_out(rooms))]]
+
+
+def _summary(found: Sequence[Mapping[str, float]]) -> list[str]:
+    share, width = ([row[name] for row in found] for name in ("albedo", "relative_width"))
+    return [_percent(np.mean(share)), f"{_percent(min(share))} to {_percent(max(share))}", _percent(np.mean(width))]
+
+
+# -------------------------------------------------------------------------------------------------------------- writing
+
+
+def document(rooms: Sequence[Room], found: Sequence[Mapping[str, float]], errors: MeasuredErrors) -> dict[str, Any]:
+    """Return what the product reads."""
+    held = {}
+    for name, (share, width) in HELD.items():
+        shares = [row[share] for row in found if np.isfinite(row[share])]
+        held[name] = {"pooled": float(np.mean(shares)), "lowest": min(shares), "highest": max(shares)}
+        held[name]["half_width"] = float(np.nanmean([row[width] for row in found]))
+    numbers = {name: float(f"{value:.4g}") for name, value in vars(errors).items()}
+    held = {name: {key: round(value, 4) for key, value in entry.items()} for name, entry in held.items()}
+    return {"errors": numbers, "held": held, "rooms": [room.scene for room in rooms]}
+
+
+def tables(rooms: Sequence[Room], found: Sequence[Mapping[str, float]], errors: MeasuredErrors) -> dict[str, str]:
+    """Return the tables of the page."""
+    from workflow.report.blocks import markdown
+
+    shares = ("albedo", "brightness", "roughness_of_claimed", "metallic")
+    rows = []
+    for room, row in zip(rooms, found, strict=True):
+        level = f"{room.level_error:+.2f} ± {student_width(np.inf) * room.room_error:.2f}"
+        rows.append([room.name, f"{row['objects']:.0f}", *(_percent(row[name]) for name in shares), level, *_widths(row)])
+    means = {name: float(np.nanmean([row[name] for row in found])) for name in found[0]}
+    inside = f"{sum(row['level'] for row in found):.0f} of {len(found)} inside"
+    objects = f"{sum(row['objects'] for row in found):.0f}"
+    rows.append(["**mean of the rooms**", objects, *(_percent(means[name]) for name in shares), inside, *_widths(means)])
+    pooled = []
+    for name in shares:
+        value = np.array([row[name] for row in found])
+        weight = np.array([row["objects"] * (row["roughness_claimed"] if name.startswith("roughness") else 1.0) for row in found])
+        pooled.append(_percent(np.average(np.nan_to_num(value), weights=weight)))
+    rows.append(["**all objects**", objects, *pooled, *[""] * 5])
+    heads = [
+        "room",
+        "objects",
+        "R, G, B",
+        "brightness",
+        "roughness, where claimed",
+        "metallic",
+        "level of the room, error ± half of 95 %",
+    ]
+    heads += ["half width: R, G, B", "relative, of the surface", "roughness", "roughness claimed of"]
+    metals = sum(row["metals"] for row in found)
+    held = sum(row["metals"] * np.nan_to_num(row["metals_held"]) for row in found)
+    numbers = [[name, f"{value:.3g}"] for name, value in vars(errors).items()]
+    numbers += [["true metals that their interval holds", f"{held:.0f} of {metals:.0f}"]]
+    level = [room.level_error for room in rooms]
+    numbers += [["level of the room: mean error, and root mean square in claimed errors", _level(level, rooms)]]
+    return {
+        "intervals": "\n".join(markdown(heads, rows)),
+        "terms": "\n".join(markdown(["with", "R, G, B held", "in a room", "half width, relative, of the surface"], terms(rooms))),
+        "constants": "\n".join(markdown(["number", "value"], numbers)),
+    }
+
+
+def _level(errors: Sequence[float], rooms: Sequence[Room]) -> str:
+    ratio = np.array(errors) / [room.room_error for room in rooms]
+    return f"{np.mean(errors):+.2f}, {np.sqrt(np.mean(ratio**2)):.1f}"
+
+
+def _widths(row: Mapping[str, float]) -> list[str]:
+    claimed = row["roughness_width_of_claimed"]
+    narrow = f"{claimed:.2f}" if np.isfinite(claimed) else "-"
+    return [f"{row['albedo_width']:.3f}", _percent(row["relative_width"]), narrow, _percent(row["roughness_claimed"])]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if np.isfinite(share) else "-"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*")
+    parser.add_argument("--make", action="store_true")
+    parser.add_argument("--variant", default="small", help="of study `intervals`, for --make")
     parser.add_argument("--quality", default="draft")
-    parser.add_argument("--pixels", type=int, default=100)
+    parser.add_argument("--cells", type=int, default=50)
     asked = parser.parse_args()
-    from workflow.report.blocks import fill, markdown
+    from workflow.report.blocks import fill
 
-    rows = json.loads(ROWS.read_text()) if ROWS.is_file() else []
     for scene in asked.scenes:
-        row = measured(scene, asked.quality, asked.pixels)
-        print(row)
-        rows = sorted([other for other in rows if other["scene"] != scene] + [row], key=lambda row: row["scene"])
-        ROWS.write_text(json.dumps(rows, indent=1) + "\n")
-    shown = [
-        [
-            row["scene"],
-            f"{row['objects']}",
-            *(f"{100 * row[name]:.0f} %" for name in ("albedo_inside", "channels_inside", "roughness_inside")),
-            f"{100 * np.expm1(row['half_width']):.0f} %",
-            *(f"{100 * np.expm1(row[name]):.0f} %" for name in ("error_50", "error_90")),
-        ]
-        for row in rows
-    ]
-    heads = ["scene", "objects", "brightness", "R, G, B by themselves", "roughness", "half the interval", "error, median"]
-    table = "\n".join(markdown([*heads, "error, 90 % of the objects"], shown))
-    PAGE.write_text(fill(PAGE.read_text(), {"intervals": table}))
+        if asked.make:
+            scene = f"{scene}--intervals-{asked.variant}-s0"
+            make(scene)
+        rows = list(measured(scene, asked.quality, asked.cells))
+        keep(scene, rows)
+        print(f"{scene}: {len(rows)} objects")
+    rooms = rooms_of(_table())
+    found, errors = left_out(rooms), fitted(rooms)
+    FILE.write_text(json.dumps(document(rooms, found, errors), indent=1) + "\n")
+    PAGE.write_text(fill(PAGE.read_text(), tables(rooms, found, errors)))
+    print(FILE.read_text())
 
 
 if __name__ == "__main__":

@@ -381,6 +381,25 @@ def test_what_is_as_likely_at_every_roughness_stays_so():
     np.testing.assert_allclose(found.deviation, ROUGHNESS_GRID.std(), rtol=1e-12)
 
 
+def test_what_the_evidence_leaves_open_is_kept():
+    """Object 0 tells nothing, object 1 its roughness; the albedo of a metal would be brighter by exp(0.5)."""
+    cost = np.full((12, 3, len(ROUGHNESS_GRID)), np.inf)
+    cost[:, :2] = 0.0
+    cost[1:, 0] += 40.0 * np.abs(ROUGHNESS_GRID - 0.57)
+    cost[1:, 1] += 2.0 + 40.0 * np.abs(ROUGHNESS_GRID - 0.32)
+    affine = np.tile(IDENTITY, (*cost.shape, 1))
+    affine[:, 1, :, :12] *= np.exp(0.5)
+    choice = chosen(cost, affine, np.full((12, 5), 0.3))
+    kinds = choice.kinds
+    assert (choice.kind == 0).all() and kinds.seen[0] == pytest.approx(0.0, abs=0.05) and kinds.seen[1] > 0.9
+    np.testing.assert_allclose(kinds.probability.sum(1), 1.0)
+    assert 0.0 < kinds.probability[1, 1] < 0.05 and kinds.probability[1, 2] < 1e-100
+    np.testing.assert_allclose(kinds.brightness[:, :2], [[0.0, 0.5]] * 12, atol=1e-12)
+    assert kinds.roughness[1, :2] == pytest.approx([0.57, 0.32], abs=0.03)
+    everything = kinds.among(np.arange(1, 13), 14)
+    assert not everything.probability[[0, 13]].any() and everything.seen[2] == kinds.seen[1]
+
+
 def chosen(cost: np.ndarray, affine: np.ndarray, base: np.ndarray) -> Choice:
     objects = len(cost)
     found = Profile(cost, affine, np.full(objects, 1.0 / EVIDENCE_DISCOUNT))

@@ -81,7 +81,7 @@ def test_kinds_are_chosen_among_those_that_agree_with_what_is_given():
     choice = choose_kinds(found, np.ones(4, bool), base, np.full(4, 100), given)
     assert choice.kind[1:].tolist() == [1, 1, 1]
     assert choice.roughness[1] == pytest.approx(0.98) and choice.roughness[3] == pytest.approx(0.32)
-    assert np.isfinite(choice.probability).all() and np.isfinite(choice.deviation).all()
+    assert np.isfinite(choice.kinds.probability).all() and np.isfinite(choice.deviation).all()
     free = choose_kinds(found, np.ones(4, bool), base, np.full(4, 100))
     assert free.kind[1] == 0  # a rough metal is none, unless somebody knows better
 

@@ -14,11 +14,14 @@ import pytest
 from PIL import Image
 
 from iif_core.camera.pinhole import look_at
+from iif_core.fitting.intervals import AlbedoIntervals, MeasuredErrors, RoughnessIntervals
+from iif_core.fitting.problem import Kinds
 from iif_core.numerics import color
 from iif_core.numerics.xp import NUMPY
 from tests.errors import named
 from tests.oracles.blender import require_bpy
 from workflow.artifacts.files import read_exr, sha256_of, write_exr
+from workflow.decisions.held import measured
 from workflow.exporters import camera_files
 from workflow.exporters.object_table import csv_bytes, hex_colour, object_rows, read_csv
 from workflow.scene.normal_form import View
@@ -150,30 +153,46 @@ def rows():
     values = np.array([[0.2, 0.4, 0.6, 0.5, 0.0], [0.4, 0.4, 0.2, 0.7, 0.0], [0.9, 0.9, 0.9, 0.1, 1.0]])
     fit = {
         "object_id": np.array([1, 0]), "std_level": np.array([0.0, 0.1]), "model": np.array(["population", "full"], object),
-        "std_roughness": np.array([[0.0, 0.0], [0.2, 0.05]]), "std_metallic": np.zeros((2, 2)),
+        "pixels": np.array([0, 78]), "given": np.array(["roughness", ""], object), "kind_seen": np.array([0.0, 1.0]),
+        "kind_probability": np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), "kind_brightness": np.zeros((2, 3)),
+        "kind_roughness": np.full((2, 3), 0.6), "kind_deviation": np.full((2, 3), 0.1),
     }  # fmt: skip
     seen = {"object_id": np.arange(3), "pixels": np.array([70, 8, 0]), "views": np.array([4, 2, 0])}
-    before = np.full((3, 5), 0.5)
-    return object_rows(["=wall", 'so, "fa"', "lost"], np.array([0, 0, 1]), values, np.full((3, 5), 0.25), before, fit, seen)
+    return object_rows(["=wall", 'so, "fa"', "lost"], np.array([0, 0, 1]), values, np.full((3, 5), 0.25), fit, 0.05, seen)
 
 
 def test_objects_are_means_with_intervals():
-    table = rows()
+    table, errors = rows(), MeasuredErrors.from_facts(measured()["errors"], "")
     assert table["base_colour_r"] == [0.3, 0.9, 0.25] and table["roughness"] == [0.6, 0.1, 0.25]  # the last has no cells
-    assert table["base_colour_r_low"][0] == pytest.approx(0.3 * np.exp(-0.19599), rel=1e-3)
-    assert table["base_colour_r_high"][0] == pytest.approx(0.3 * np.exp(0.19599), rel=1e-3)
-    sigma = np.hypot(0.5 * 0.2, 0.05)
-    assert table["roughness_high"][0] == pytest.approx(0.6 + 1.96 * sigma, rel=1e-3)
-    for name in ("base_colour_r_low", "roughness_low", "metallic_low"):
-        assert table[name][1:] == [None, None], name  # not fitted: no interval is claimed
+    kinds = Kinds(np.eye(1, 3), np.zeros((1, 3)), np.full((1, 3), 0.6), np.full((1, 3), 0.1), np.ones(1))
+    low, high = AlbedoIntervals.of([[0.3, 0.4, 0.4]], [0.1], [78], 0.05, kinds, errors).ends(errors.albedo)
+    for c, name in enumerate("rgb"):
+        assert table[f"base_colour_{name}_low"][0] == pytest.approx(low[0, c], rel=1e-4), name
+        assert table[f"base_colour_{name}_high"][0] == pytest.approx(high[0, c], rel=1e-4), name
+    low, high = RoughnessIntervals.of([0.6], kinds).ends(errors.roughness)
+    assert (table["roughness_low"][0], table["roughness_high"][0]) == pytest.approx((low[0], high[0]), rel=1e-4)
+    assert (table["metallic_low"][0], table["metallic_high"][0]) == (0.0, 0.0)  # surely a dielectric
+    assert (table["roughness_low"][1], table["roughness_high"][1]) == (0.1, 0.1)  # given by hand
+    for name in ("base_colour_r", "metallic"):
+        assert table[f"{name}_low"][1:] == [0.0, 0.0] and table[f"{name}_high"][1:] == [1.0, 1.0], name  # not fitted
     assert table["pixels"] == [70, 8, 0] and table["photographs"] == [4, 2, 0] and table["model"] == ["full", "population", ""]
     assert table["base_colour_hex"][2] == "#898989" == hex_colour(np.full(3, 0.25))
+
+
+def test_without_errors_nothing_is_claimed():
+    """A fit that states no errors, such as those that are compared with."""
+    fit = {"object_id": np.array([0]), "pixels": np.array([9]), "model": np.array(["mean"], object)}
+    table = object_rows(
+        ["a"], np.zeros(1, int), np.full((1, 5), 0.5), np.full((1, 5), 0.5), fit, np.nan, {"object_id": np.zeros(1, int)}
+    )
+    for name in ("base_colour_r", "roughness", "metallic"):
+        assert (table[f"{name}_low"], table[f"{name}_high"]) == ([0.0], [1.0]), name
 
 
 def test_csv_is_read_back_and_holds_no_formula():
     found = read_csv(csv_bytes(rows()))
     assert [row["name"] for row in found] == ["'=wall", 'so, "fa"', "lost"]
-    assert found[1]["roughness_low"] == "" and float(found[0]["base_colour_g"]) == 0.4
+    assert found[2]["area_m2"] == "" and float(found[0]["base_colour_g"]) == 0.4
 
 
 # -------------------------------------------------------------------------------------------------------------- Blender

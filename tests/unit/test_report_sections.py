@@ -6,11 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from workflow.decisions import held
 from workflow.report import scores, views
 from workflow.report.emitters import emitter_note, emitter_rows
 from workflow.report.evidence import roughness_interval, unfitted_share
 from workflow.report.facts import end_words, objects_words
-from workflow.report.materials import material_rows
+from workflow.report.materials import intervals_note, material_rows
 from workflow.report.response import response_drawing
 from workflow.report.strips import exposure_of_emission
 
@@ -24,7 +25,7 @@ def test_objects_that_take_what_others_have_count_by_their_pixels():
     assert unfitted_share({"pixels": pixels}) is None and unfitted_share({"model": model, "pixels": 0 * pixels}) is None
 
 
-def object_row(value="0.5", low="", high="", pixels="1"):
+def object_row(value="0.5", low="0.0", high="1.0", pixels="1"):
     return {"roughness": value, "roughness_low": low, "roughness_high": high, "pixels": pixels}
 
 
@@ -32,7 +33,7 @@ def test_the_interval_of_roughness_is_that_of_half_of_the_pixels():
     narrow, wide = object_row(low="0.4", high="0.55", pixels="6"), object_row(low="0.1", high="0.6", pixels="5")
     assert roughness_interval([wide, narrow]) == pytest.approx(0.1)  # on its longer side
     assert roughness_interval([wide, wide, narrow]) == pytest.approx(0.4)
-    assert roughness_interval([narrow, object_row(pixels="7")]) is None  # most pixels have none
+    assert roughness_interval([narrow, object_row(pixels="7")]) is None  # no photograph shows that of most pixels
     assert roughness_interval([]) is None and roughness_interval([object_row(pixels="")]) is None
 
 
@@ -88,13 +89,24 @@ def test_how_the_fit_ended_and_what_the_objects_are():
 
 
 def test_materials_that_most_pixels_show_come_first():
-    plain = {f"base_colour_{c}": v for c, v in zip("rgb", ("0.5", "0.25", "0.125"), strict=True)} | {"base_colour_r_low": "0.4"}
+    plain = {f"base_colour_{c}": v for c, v in zip("rgb", ("0.5", "0.25", "0.125"), strict=True)}
+    plain |= {"base_colour_r_low": "0.4", "base_colour_r_high": "0.75"}
     plain |= {"roughness": "0.5", "roughness_low": "0.25", "roughness_high": "0.75", "model": "full"}
-    plain |= {"metallic": "0", "metallic_low": "", "metallic_high": ""}
+    plain |= {"metallic": "0", "metallic_low": "0.0", "metallic_high": "1.0"}
     rows = material_rows([plain | {"pixels": ""}, plain | {"pixels": "8"}])
     assert [row["pixels"] for row in rows] == ["8", ""]
-    assert rows[0]["level"] == "(× 0.80 to 1.25)" and rows[0]["roughness_interval"] == "(0.25 to 0.75)"
-    assert rows[0]["metallic_interval"] == "" and rows[0]["linear"] == "0.500, 0.250, 0.125" and "linear" not in plain
+    assert rows[0]["level"] == "(0.40 to 0.75)" and rows[0]["roughness_interval"] == "(0.25 to 0.75)"
+    assert (
+        rows[0]["metallic_interval"] == "(0.00 to 1.00)" and rows[0]["linear"] == "0.500, 0.250, 0.125" and "linear" not in plain
+    )
+
+
+def test_what_intervals_held_is_what_was_measured(monkeypatch):
+    shares = {"pooled": 0.951, "lowest": 0.874, "highest": 1.0}
+    document = {"held": {name: shares for name in ("albedo", "roughness", "metallic")}, "rooms": ["a", "b"]}
+    monkeypatch.setattr(held, "measured", lambda: document)
+    assert held.words("albedo") == "95 % (87 to 100 % in a room)" and held.rooms() == 2
+    assert intervals_note().count(held.words("albedo")) == 3
 
 
 def test_lamps_are_told_by_their_power():

@@ -5,17 +5,18 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 
 import numpy as np
 
+from iif_core.fitting.intervals import AlbedoIntervals, MeasuredErrors, MetallicIntervals, RoughnessIntervals
+from iif_core.fitting.problem import Kinds
 from iif_core.numerics import color
-from iif_core.reflectance.material import CHANNELS
+from workflow.artifacts.store import StageReader
+from workflow.decisions.held import FILE, measured
 from workflow.scene.recovered import Recovered
 
 Array = np.ndarray
-
-NORMAL_95 = 1.959964
-"""Half a 95 % interval of the normal distribution, in standard deviations."""
 
 
 def object_rows(
@@ -23,43 +24,47 @@ def object_rows(
     cell_object: Array,
     cell_values: Array,
     object_values: Array,
-    base_values: Array,
     fit: Mapping[str, Array],
+    room_error: float,
     seen: Mapping[str, Array],
 ) -> dict[str, list]:
     """Return the columns of objects.csv, one entry per object; None where a number is not known.
 
-    Intervals hold the errors of the fitted numbers. For albedo it is the error of its level, a factor exp(+-1.96 sigma). For
-    roughness and metallic they are the errors of factor and offset of `T x + t`, taken as independent, sigma^2 = (x sigma_T)^2 +
-    sigma_t^2. Numbers that were not fitted have no error, and no interval is claimed for them.
+    Intervals are those of `iif_core.fitting.intervals`; 0 to 1 where nothing is known. What was given by hand is taken as exact.
 
     Args:
         names: one per object id.
         cell_object: (c,) object of each surface cell; cell_values: (c, 5) fitted albedo R G B (linear), roughness, metallic.
-        object_values: (objects, 5) the same for objects without cells; base_values: (objects, 5) before the fit.
-        fit: columns of affines/objects.parquet; seen: columns of segmentation/objects.parquet.
+        object_values: (objects, 5) the same for objects without cells.
+        fit: columns of affines/objects.parquet; room_error: error of the logarithm of the level of the room.
+        seen: columns of segmentation/objects.parquet.
     """
     n = len(names)
     count = np.bincount(cell_object, minlength=n)[:n]
     mean = np.stack([np.bincount(cell_object, cell_values[:, i].astype(np.float64), n)[:n] for i in range(5)], 1)
     mean = np.where(count[:, None] > 0, mean / np.maximum(count, 1)[:, None], object_values[:n])
     mean = np.clip(mean, 0, 1)
-    level = _fitted(_by_id(fit, "std_level", n))
-    low, high = mean[:, :3] * np.exp(-NORMAL_95 * level)[:, None], mean[:, :3] * np.exp(NORMAL_95 * level)[:, None]
+    errors, kinds = MeasuredErrors.from_facts(measured()["errors"], str(FILE)), kinds_of(fit, n)
+    level, pixels = _by_id(fit, "std_level", n), _by_id(fit, "pixels", n)
+    low, high = AlbedoIntervals.of(mean[:, :3], level, pixels, room_error, kinds, errors).ends(errors.albedo)
+    of_others = {
+        "roughness": RoughnessIntervals.of(mean[:, 3], kinds).ends(errors.roughness),
+        "metallic": MetallicIntervals.of(mean[:, 4], kinds).ends(errors.metallic),
+    }
+    given = dict(zip(np.asarray(fit["object_id"]).tolist(), fit["given"], strict=True)) if "given" in fit else {}
     columns: dict[str, list] = {
         "object_id": list(range(n)),
         "name": list(names),
         "base_colour_hex": [hex_colour(rgb) for rgb in mean[:, :3]],
         **{f"base_colour_{c}": _numbers(mean[:, i]) for i, c in enumerate("rgb")},
         **{f"base_colour_{c}_low": _numbers(low[:, i]) for i, c in enumerate("rgb")},
-        **{f"base_colour_{c}_high": _numbers(np.minimum(high[:, i], 1)) for i, c in enumerate("rgb")},
+        **{f"base_colour_{c}_high": _numbers(high[:, i]) for i, c in enumerate("rgb")},
     }
-    for channel, name in ((3, "roughness"), (4, "metallic")):
-        std = _by_id(fit, f"std_{name}", n, 2)
-        sigma = _fitted(np.hypot(base_values[:n, channel] * std[:, 0], std[:, 1]))
+    for channel, (name, (low, high)) in enumerate(of_others.items(), 3):
+        exact = np.array([name in str(given.get(i, "")) for i in range(n)], bool)
         columns[name] = _numbers(mean[:, channel])
-        columns[f"{name}_low"] = _numbers(np.maximum(mean[:, channel] - NORMAL_95 * sigma, 0))
-        columns[f"{name}_high"] = _numbers(np.minimum(mean[:, channel] + NORMAL_95 * sigma, 1))
+        columns[f"{name}_low"] = _numbers(np.where(exact, mean[:, channel], low))
+        columns[f"{name}_high"] = _numbers(np.where(exact, mean[:, channel], high))
     columns["pixels"] = _counts(_by_id(seen if "pixels" in seen else fit, "pixels", n))
     columns["photographs"] = _counts(_by_id(seen, "views", n))
     columns["area_m2"] = _numbers(_by_id(seen, "area_m2", n))
@@ -68,15 +73,20 @@ def object_rows(
     return columns
 
 
-def recovered_objects(
-    recovered: Recovered, base: Mapping[str, Array], fit: Mapping[str, Array], seen: Mapping[str, Array]
-) -> dict[str, list]:
-    """Return the columns of objects.csv of a recovered scene, from objects.parquet of the base texture (`base`), of stage affines
-    (`fit`) and of stage segmentation (`seen`)."""
-    surface = recovered.surface
-    before = surface.object_values.astype(np.float64).copy()
-    before[base["object_id"]] = np.stack([base[name] for name in CHANNELS], 1)
-    return object_rows(recovered.object_names, surface.cell_object, surface.cell_values, surface.object_values, before, fit, seen)
+def recovered_objects(recovered: Recovered, fitted: StageReader, seen: Mapping[str, Array]) -> dict[str, list]:
+    """Return the columns of objects.csv of a recovered scene, from stage affines (`fitted`) and objects.parquet of stage
+    segmentation (`seen`)."""
+    surface, fit = recovered.surface, fitted.table("objects.parquet")
+    scale = fitted.json("affines.json").get("scale") or {}
+    room_error = float(scale.get("relative_error", np.nan))
+    return object_rows(
+        recovered.object_names, surface.cell_object, surface.cell_values, surface.object_values, fit, room_error, seen
+    )
+
+
+def kinds_of(fit: Mapping[str, Array], n: int) -> Kinds:
+    """Return what the fit left open of n objects, from the columns of affines/objects.parquet; 0 where it does not say."""
+    return Kinds(**{f.name: np.nan_to_num(_by_id(fit, f"kind_{f.name}", n, 0 if f.name == "seen" else 3)) for f in fields(Kinds)})
 
 
 def hex_colour(linear: Array) -> str:
@@ -114,11 +124,6 @@ def _by_id(table: Mapping[str, Array], column: str, n: int, width: int = 0) -> A
         known = (ids >= 0) & (ids < n)
         out[ids[known]] = np.asarray(table[column], np.float64)[known]
     return out
-
-
-def _fitted(error: Array) -> Array:
-    """Return errors with NaN in the place of 0, which says that a number was not fitted."""
-    return np.where(error > 0, error, np.nan)
 
 
 def _numbers(values: Array) -> list[float | None]:

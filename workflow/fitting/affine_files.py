@@ -8,7 +8,7 @@ import numpy as np
 
 from iif_core.camera.response import response_facts
 from iif_core.fitting.object_levels import level_deviation
-from iif_core.fitting.problem import FitProblem, FitResult, albedo_uncertainty
+from iif_core.fitting.problem import FitProblem, FitResult, Kinds, albedo_uncertainty
 from iif_core.reflectance.material import CHANNELS, NUMBERS_OF, apply_affines
 from workflow.artifacts.store import ids_from_disk, split_rgb
 from workflow.decisions import camera, materials, numerics
@@ -81,7 +81,13 @@ def _write_objects(job: Job, names: list[str], fit: FitResult, given: np.ndarray
         "model": np.array(fit.model, dtype=str),
         "given": np.array(materials.given_words(len(names), given), dtype=str),
     }
+    columns |= kind_columns(fit.kinds or Kinds.unknown(len(names)))
     job.writer.table("objects.parquet", columns, {"residual": "sensor value"})
+
+
+def kind_columns(kinds: Kinds) -> dict[str, np.ndarray]:
+    """Return the columns of objects.parquet that say what the fit left open."""
+    return {f"kind_{name}": value for name, value in vars(kinds).items()}
 
 
 def _write_cells(job: Job, fit: FitResult, albedo: np.ndarray | None) -> None:

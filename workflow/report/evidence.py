@@ -80,11 +80,11 @@ def unfitted_share(objects: Mapping[str, np.ndarray]) -> float | None:
 
 def roughness_interval(objects: Sequence[Mapping[str, str]]) -> float | None:
     """Return half of the 95 % interval of roughness, on its longer side, as the median over the pixels seen, from the rows of
-    objects.csv; None where less than half of the pixels are on objects that have one."""
+    objects.csv; None where less than half of the pixels are on objects whose interval is narrower than 0 to 1."""
     width, pixels = [], []
     for row in objects:
-        value, low, high = (float(row[f"roughness{end}"] or "inf") for end in ("", "_low", "_high"))
-        width.append(max(high - value, value - low))
+        value, low, high = (float(row[f"roughness{end}"]) for end in ("", "_low", "_high"))
+        width.append(max(high - value, value - low) if high - low < 1 else np.inf)
         pixels.append(float(row["pixels"] or 0))
     if not sum(pixels):
         return None

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from iif_core.numerics import color
+from workflow.decisions import held
 from workflow.report.wording import fit_words
 
 
@@ -19,13 +20,22 @@ def material_rows(objects: Iterable[Mapping[str, str]]) -> list[dict[str, str]]:
         row["linear"] = ", ".join(f"{v:.3f}" for v in colour)
         row["luminance"] = f"{color.luminance(np.array(colour)):.5f}"
         brightest = max("rgb", key=lambda c: float(row[f"base_colour_{c}"]))
-        low, middle = row[f"base_colour_{brightest}_low"], float(row[f"base_colour_{brightest}"])
-        # The interval of the level is a factor, and the same for all channels; its lower end is never cut off.
-        row["level"] = f"(× {float(low) / middle:.2f} to {middle / float(low):.2f})" if low and float(low) > 0 else ""
+        low, high = (float(row[f"base_colour_{brightest}{end}"]) for end in ("_low", "_high"))
+        row["level"] = f"({low:.2f} to {high:.2f})"
         for name in ("roughness", "metallic"):
-            low, high = row[f"{name}_low"], row[f"{name}_high"]
+            low, high = (float(row[f"{name}{end}"]) for end in ("_low", "_high"))
             row[f"{name}_text"] = f"{float(row[name]):.2f}"
-            row[f"{name}_interval"] = f"({float(low):.2f} to {float(high):.2f})" if low and high else ""
+            row[f"{name}_interval"] = f"({low:.2f} to {high:.2f})"
         row["model"] = fit_words(row["model"])
         rows.append(row)
     return sorted(rows, key=lambda row: -float(row["pixels"] or 0))
+
+
+def intervals_note() -> str:
+    """Say what the intervals of the table are, and how often such intervals held."""
+    shares = [f"{name} of {held.words(name)}" for name in ("albedo", "roughness", "metallic")]
+    return (
+        "In brackets the 95 % interval, for albedo of its brightest channel; roughness that no photograph shows has 0 to 1."
+        f" In {held.rooms()} rooms with truth such intervals held the {', '.join(shares[:2])} and {shares[2]}"
+        " of the objects that they are claimed of."
+    )

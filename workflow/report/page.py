@@ -124,6 +124,7 @@ class Page:
     pairs_note: str
     views: Sequence[ViewRows]
     objects: Sequence[Mapping[str, str]]
+    objects_note: str
     emitters: Sequence[dict[str, Any]]
     emitter_note: str
     response_svg: str

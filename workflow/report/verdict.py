@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from workflow.decisions import held
 from workflow.report.wording import percent
 
 GREEN, AMBER, RED = "green", "amber", "red"
@@ -54,7 +55,7 @@ LIMITS: dict[str, Limit] = {
     "albedo": Limit(20.0, 14.0, "dB against the truth: 20 is an error of 0.1; one grey for a whole room reaches 10 to 12"),
     "roughness": Limit(20.0, 10.0, "dB against the truth: 20 is an error of 0.1, 10 one of 0.3; rooms have 13 to 24"),
     "metallic": Limit(20.0, 10.0, "dB against the truth: 20 is an error of 0.1; rooms, mostly without metal, have 19 or more"),
-    "roughness_interval": Limit(0.1, 0.3, "half of the 95 % interval, median over the pixels; four rooms have 0.15 to 0.46"),
+    "roughness_interval": Limit(0.1, 0.3, "half of the 95 % interval, median over the pixels; 13 rooms have 0.22 to 0.38"),
     "uncertainty": Limit(0.1, 0.2, "claimed standard error of the albedo, median over the surface; rooms have 0.02 to 0.05"),
     "unfitted": Limit(0.2, 0.6, "share of the pixels on objects that could not be fitted by themselves"),
     "level_error": Limit(0.25, 0.5, "claimed relative error of the level; rooms with truth have 0.05 to 0.28"),
@@ -385,7 +386,7 @@ def _materials(e: Evidence) -> Light:
 
 
 def _gloss(e: Evidence) -> list[Finding | None]:
-    """Judge roughness and metallic: by the truth, or else by what the fit claims, which is too little by experience."""
+    """Judge roughness and metallic: by the truth, or else by their intervals."""
     remedy = "Compare 'roughness' of result and truth; what you know, set under `materials` in the scene file"
     if e.has_truth:
         return [
@@ -399,19 +400,15 @@ def _gloss(e: Evidence) -> list[Finding | None]:
         ]  # fmt: skip
     remedy = "Photograph what shines from more directions; what you know, set under `materials` in the scene file"
     if e.roughness_interval is None:
-        return [Finding(AMBER, "Roughness was measured on less than 50 % of the surface seen; elsewhere it is a guess", remedy)]
+        return [Finding(AMBER, "Photographs show the roughness of less than 50 % of the surface; the rest is guessed", remedy)]
     return [
         _finding(
             "roughness_interval", e.roughness_interval,
-            "Roughness is known to within ±{} by the fit's own claim of 95 %, which held for"
-            f" {ROUGHNESS_HELD[0]} to {ROUGHNESS_HELD[1]} % of the objects in rooms with truth",
+            f"Roughness is known to within ±{{}}; in {held.rooms()} rooms with truth, 95 % intervals of roughness held"
+            f" for {held.words('roughness')} of the objects that they are claimed of",
             remedy, ".2f", AMBER,
         )
     ]  # fmt: skip
-
-
-ROUGHNESS_HELD = (76, 85)
-"""Per cent of the objects whose true roughness is inside the 95 % interval, in three rooms (docs/guide/accuracy.md)."""
 
 
 def _off(psnr: float | None) -> str:

@@ -15,7 +15,6 @@ from iif_core.reflectance.brdf import R_MIN, kd_ks
 from iif_core.reflectance.directional_albedo import directional_albedo
 from iif_core.surface.triangles import face_geometry
 from workflow.exporters.atlas import Atlas, TexturedPart
-from workflow.exporters.object_table import NORMAL_95
 from workflow.report.pictures import false_colour
 from workflow.report.wording import fit_words
 from workflow.room.light import Lamps, LitTexels
@@ -38,6 +37,8 @@ EYE_HEIGHT = 1.6
 """Metres above the floor."""
 BRIGHT = 0.8
 """Linear value, on the screen, of the light that 95 % of the surface do not exceed."""
+NORMAL_95 = 1.959964
+"""Half a 95 % interval of the normal distribution, in standard deviations."""
 MARGIN = 0.15
 """Metres that the eye keeps from the ends of the room."""
 

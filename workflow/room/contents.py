@@ -8,14 +8,13 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.numerics import color
-from workflow.exporters.object_table import object_rows
+from workflow.exporters.object_table import recovered_objects
 from workflow.report import pictures
 from workflow.room import build
 from workflow.room.light import Lamps
 from workflow.room.pack import Blob
 from workflow.room.page import Page, render_page
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import read_base_scene
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import Recovered
 
@@ -60,7 +59,7 @@ def _about(job: Job) -> list[str]:
         "Materials and lamps were recovered from photographs. The light of each lamp was traced once, with all reflections"
         f" ({samples} paths for each texel), and stored; the page adds the lamps up, so that strengths and colours are exact for"
         " diffuse light.",
-        "Intervals are 95 % intervals of the fit; the interval of albedo is for its brightness.",
+        "Intervals are 95 % intervals; roughness that no photograph shows has 0 to 1.",
     ]
 
 
@@ -101,9 +100,5 @@ def radiance_of_emitters(job: Job, recovered: Recovered) -> dict[int, list[dict[
 
 
 def facts_of_objects(job: Job, recovered: Recovered) -> list[dict[str, Any]]:
-    surface, base = recovered.surface, read_base_scene(job)
-    fit, seen = job.read("affines").table("objects.parquet"), job.read("segmentation").table("objects.parquet")
-    columns = object_rows(
-        recovered.object_names, surface.cell_object, surface.cell_values, surface.object_values, base.object_values, fit, seen
-    )
+    columns = recovered_objects(recovered, job.read("affines"), job.read("segmentation").table("objects.parquet"))
     return build.object_facts(columns)

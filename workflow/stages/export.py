@@ -15,7 +15,6 @@ from workflow.exporters.object_table import csv_bytes, recovered_objects
 from workflow.exporters.usd import BASE_COLOR, SURFACE, usd_bytes
 from workflow.relighting.inventory import Inventory
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import read_base
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.picture_facts import view_attributes
 from workflow.scene.recovered import read_recovered, read_response
@@ -60,8 +59,7 @@ def run(job: Job) -> None:
     lamps = {lamp.emitter_id: inventory.name_of(lamp) for lamp in inventory.lamps if lamp.objects}
     emitters = emitter_columns(job.read("emission").table("emitters.parquet"), lamps, recovered.light_scale)
     job.writer.table("emitters.parquet", emitters, UNITS)
-    stages = read_base(job), job.read("affines"), job.read("segmentation")
-    objects = recovered_objects(recovered, *(stage.table("objects.parquet") for stage in stages))
+    objects = recovered_objects(recovered, job.read("affines"), job.read("segmentation").table("objects.parquet"))
     job.writer.bytes("objects.csv", csv_bytes(objects))
     _camera_files(job, capture, environment)
     facts = {

@@ -16,7 +16,7 @@ from workflow.report.downloads import commands, downloads
 from workflow.report.emitters import emitter_note, emitter_rows
 from workflow.report.evidence import NUMERICS, evidence_of
 from workflow.report.facts import facts_of
-from workflow.report.materials import material_rows
+from workflow.report.materials import intervals_note, material_rows
 from workflow.report.page import Page, ViewRows, render_page
 from workflow.report.reported import Reported
 from workflow.report.response import response_drawing
@@ -69,6 +69,7 @@ def run(job: Job) -> None:
         pairs_note=views.pairs_note(len(ranked), summary["views"]),
         views=_drawn(job, scene, views.spread(ranked, job.settings.report.views), psnr),
         objects=material_rows(objects),
+        objects_note=intervals_note(),
         emitters=emitter_rows(export.table("emitters.parquet")),
         emitter_note=emitter_note(capture.is_hdr, recovered.light_scale),
         response_svg=svg,

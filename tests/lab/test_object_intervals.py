@@ -1,0 +1,77 @@
+"""The measurement of intervals: rooms that follow the model, rooms left out, and the file that the product reads."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from iif_core.errors import InputError
+from iif_core.fitting.intervals import MeasuredErrors
+from iif_core.fitting.problem import Kinds
+from lab.benchmarks import object_intervals as measurement
+from workflow.decisions.held import FILE
+
+TRUE = MeasuredErrors(additive=0.01, border=0.4, hue=0.05, albedo=1.0, roughness=1.0, metallic=1.0)
+
+
+def room(seed: int, scale: float = 1.0, objects: int = 200) -> measurement.Room:
+    """Errors of a room that follow the model, times `scale`."""
+    rng = np.random.default_rng(seed)
+    truth = np.c_[rng.uniform(0.03, 0.7, (objects, 3)), rng.uniform(0.2, 0.8, objects), np.zeros(objects)]
+    level, pixels = rng.uniform(0.03, 0.1, objects), 10 ** rng.uniform(2, 5, objects)
+    of_level = level / stats.t.ppf(stats.norm.cdf(1), 4) * rng.standard_t(4, objects)
+    hue, additive = TRUE.hue * rng.normal(size=(objects, 3)), np.hypot(TRUE.additive, TRUE.border / np.sqrt(pixels))
+    albedo = truth[:, :3] * np.exp(scale * (of_level[:, None] + hue)) + scale * additive[:, None] * rng.normal(size=(objects, 3))
+    roughness = np.clip(truth[:, 3] + 0.08 * scale * rng.normal(size=objects), 0.02, 1)
+    none = np.zeros((objects, 3))
+    kinds = Kinds(none + [1.0, 0.0, 0.0], none, none + 0.5, none + 0.08, np.ones(objects))
+    estimate = np.c_[np.clip(albedo, 0, 1), roughness, np.zeros(objects)]
+    return measurement.Room(f"r{seed}", estimate, truth, level, 1e-3, np.full(objects, 100.0), pixels, kinds)
+
+
+def test_errors_of_the_model_are_found_again():
+    found = measurement.fitted([room(seed) for seed in range(8)])
+    assert found.hue == pytest.approx(TRUE.hue, rel=0.25)
+    assert found.additive == pytest.approx(TRUE.additive, rel=0.35) and found.border == pytest.approx(TRUE.border, rel=0.35)
+    assert found.albedo == pytest.approx(1.0, abs=0.2) and found.metallic == 1.0
+
+
+def test_a_room_is_judged_by_the_others_alone():
+    """The room of larger errors is not held by what others say, however many variants of it there are."""
+    rooms = [room(seed, objects=80) for seed in range(5)]
+    odd = replace(room(9, scale=8.0, objects=80), scene="odd--intervals-small-s0")
+    shares = [row["albedo"] for row in measurement.left_out([*rooms, odd, replace(odd, scene="odd--intervals-other-s0")])]
+    assert min(shares[:5]) > 0.9 and max(shares[5:]) < 0.7
+    assert np.mean([row["albedo"] for row in measurement.left_out(rooms)]) == pytest.approx(0.95, abs=0.025)
+
+
+def test_too_few_objects_make_no_constants():
+    with pytest.raises(InputError):
+        measurement.fitted([room(0, objects=5)])
+
+
+def test_rows_of_a_scene_replace_those_that_it_had(tmp_path, monkeypatch):
+    monkeypatch.setattr(measurement, "ROWS", tmp_path / "rows.csv")
+    rows = [dict.fromkeys(measurement.COLUMNS, 1.0) | {"scene": scene, "object": 3} for scene in ("b", "a")]
+    for row in rows:
+        measurement.keep(row["scene"], [row])
+    measurement.keep("b", [rows[0] | {"object": 10}, rows[0] | {"object": 9}])
+    found = measurement._table()
+    assert [(row["scene"], row["object"]) for row in found] == [("a", "3"), ("b", "9"), ("b", "10")]
+    first, second = measurement.rooms_of(found)
+    assert first.estimate.shape == (1, 5) and second.kinds.brightness.shape == (2, 3) and second.room_error == 1.0
+
+
+def test_the_file_of_the_product_is_what_the_table_says():
+    rooms = measurement.rooms_of(measurement._table())
+    found = measurement.document(rooms, measurement.left_out(rooms), measurement.fitted(rooms))
+    shipped = json.loads(FILE.read_text())
+    assert shipped["rooms"] == found["rooms"]
+    for part in ("errors", *(f"held.{name}" for name in found["held"])):
+        section, _, name = part.partition(".")
+        own, kept = (document[section][name] if name else document[section] for document in (found, shipped))
+        assert own == pytest.approx(kept, rel=1e-3, abs=1e-3), part
