@@ -82,12 +82,12 @@ def llvm():
 def test_scene() -> Callable[[str], Path]:
     """`test_scene(name)`: folder of a scene from outside; skips where no place has it.
 
-    Places: $IIF_TEST_SCENES alone if it is set, else data/, else ../shared/scenes, relative to the checkout.
+    Places: $IIF_TEST_SCENES alone if it is set, else data/, else the folders */scenes next to the checkout.
     """
 
     def find(name: str) -> Path:
         named = os.environ.get("IIF_TEST_SCENES")
-        places = [Path(named)] if named else [REPOSITORY / "data", REPOSITORY.parent / "shared" / "scenes"]
+        places = [Path(named)] if named else [REPOSITORY / "data", *sorted(REPOSITORY.parent.glob("*/scenes"))]
         for place in places:
             if (place / name).is_dir():
                 return (place / name).resolve()
