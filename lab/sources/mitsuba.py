@@ -9,6 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,20 +17,19 @@ import numpy as np
 
 from iif_core.errors import InputError
 from lab.mitsuba_scene.document import referenced_files
-from lab.sources.rendered import DENOISED, RenderedWriter
+from lab.sources.delivery import Delivered, Rendered, Renderings, deliver, effects, metered
+from lab.sources.rendered import RenderedWriter
 from workflow.intake.meshes import check_mesh
 from workflow.intake.pictures import check_texture
-from workflow.models.denoise import denoise, require_denoiser
 from workflow.scene.normal_form import Truth, View
 
 if TYPE_CHECKING:
+    from lab.simulated.scanned import Scanned
     from workflow.runtime.job import Job
 
 Array = np.ndarray
 
 FIELD_OF_VIEW = 75.0  # degrees across the wider side, for all views except the scene's own
-RESPONSE = "filmic"
-METERING_PIXELS = 4096  # per view; their radiance sets the exposure
 DEPTH_TOLERANCE = 1e-4
 """Relative difference of depth between mesh and original surface above which a pixel has no truth (glass in between)."""
 ROUND_DEPTH_TOLERANCE = 0.01
@@ -59,8 +59,6 @@ def capture(job: Job) -> None:
     native.prepare()
     device.mitsuba()
     native.limit_threads(job.threads)
-    if job.settings.capture.denoise:
-        require_denoiser()
     _Capture(job).run()
 
 
@@ -70,6 +68,7 @@ class _Capture:
     def __init__(self, job: Job):
         self.job, self.settings, self.source = job, job.settings.capture, job.settings.source
         self.writer = RenderedWriter(job.writer)
+        self.renderings = Renderings(self.settings)
 
     def run(self) -> None:
         import mitsuba as mi
@@ -98,15 +97,17 @@ class _Capture:
         del everything
         shapes, instance = np.unique(self.mesh.shape, return_inverse=True)
         names = [self.mesh.shapes[i].name for i in shapes]
-        self.writer.mesh(self.mesh.vertices, self.mesh.faces, instance.astype(np.int32), names, self.mesh.emission)
+        scan = self._scanned(instance) if effects(self.settings).mesh else None
+        mesh, ids = (self.mesh, instance.astype(np.int32)) if scan is None else (scan, scan.ids[:, 0])
+        self.writer.mesh(mesh.vertices, mesh.faces, ids, names, mesh.emission)
         with tempfile.TemporaryFile() as scratch:
             shape = (len(views), self.settings.height, self.settings.width, 3)
             radiance = np.memmap(scratch, np.float32, "w+", shape=shape)
-            self._views(views, radiance)
-            views = self._photographs(views, radiance)
-            del radiance
-        self.writer.cameras(views)
-        self._finish()
+            rendered = self._views(views, radiance)
+            truth_at = self._truth if scan is None else partial(self._truth, scan=scan)
+            found = deliver(self.job, self.writer, rendered, (mesh.vertices, mesh.faces), truth_at)
+            del radiance, rendered
+        self._finish(found)
 
     # ------------------------------------------------------------------------------------------------------ scene
 
@@ -196,15 +197,14 @@ class _Capture:
 
     # ------------------------------------------------------------------------------------------------------ views
 
-    def _views(self, views: list[View], radiance: Array) -> None:
+    def _views(self, views: list[View], radiance: Array) -> Rendered:
         """Write G-buffer and truth of every view and fill in `radiance`, from which the photographs are made."""
         from lab.mitsuba_scene import render
 
         integrator = render.path_integrator(self.source.max_bounces)
         render.balance_lights(self.loaded.scene, self.loaded.scene.shapes())
         self.dropped = 0
-        self.usable: list[Array] = []
-        self.meter: list[tuple[Array, Array]] = []
+        out = Rendered(views, radiance, [], [])
         for i, view in enumerate(views):
             kept = self.writer.kept(view.name)
             image, emits, facts = self._render(view, integrator) if kept is None else kept
@@ -212,11 +212,10 @@ class _Capture:
             valid = np.ones(image.shape[:2], bool)
             valid.ravel()[facts["invalid"]] = False
             radiance[i] = image
-            self.usable.append(np.packbits(valid))
-            step = max(1, image.shape[0] * image.shape[1] // METERING_PIXELS)
-            dark = (valid & ~emits).ravel()[::step]
-            self.meter.append((image.reshape(-1, 3)[::step], dark))
+            out.usable.append(np.packbits(valid))
+            out.meters.append(metered(image, valid & ~emits))
             self.job.progress(i + 1, len(views), "rendered views")
+        return out
 
     def _render(self, view: View, integrator: Any) -> tuple[Array, Array, dict[str, Any]]:
         """Write G-buffer and truth of a view; return its radiance (H, W, 3), where it shows emitters (H, W), and what else is
@@ -224,9 +223,9 @@ class _Capture:
         from lab.mitsuba_scene import render
 
         depth, face, truth = self._gbuffer(view)
-        image, valid, dropped = render.render_view(self.loaded.scene, integrator, view, self.settings.samples, self.job.seed)
-        if self.settings.denoise:
-            image = denoise(image, truth.albedo, self._normals(view, face))
+        samples = self.renderings.samples
+        image, valid, dropped = render.render_view(self.loaded.scene, integrator, view, samples, self.job.seed)
+        image = self.renderings.denoised(image, truth.albedo, self._normals(view, face))
         facts = {"dropped": dropped, "invalid": np.flatnonzero(~valid).tolist()}
         self.writer.rendered(view.name, depth, face, replace(truth, radiance=image), facts)
         return image, truth.emission.any(-1), facts
@@ -234,7 +233,7 @@ class _Capture:
     def _gbuffer(self, view: View) -> tuple[Array, Array, Truth]:
         """Return z-depth, face ids and material truth at the pixel centres; the radiance of the truth is still 0."""
         from iif_core.light.transport.geometry import trace
-        from lab.mitsuba_scene import materials, render
+        from lab.mitsuba_scene import render
 
         origin = view.world_from_camera[:3, 3]
         rays = view.directions().reshape(-1, 3)
@@ -242,14 +241,38 @@ class _Capture:
         hit = np.flatnonzero(face >= 0)
         if view.view_id == 0 and not len(hit):
             raise InputError(f"{self.source.path}: the scene's sensor sees no surface; point it into the room")
-        on = face[hit]
-        point = origin + t[hit, None].astype(np.float64) * rays[hit]
-        surface = self.table.evaluate(self.mesh, on, materials.barycentric_of(self.mesh, on, point))
-        front = (self.geometry.normals[on] * rays[hit]).sum(1) < 0
+        on, t = face[hit], np.where(face >= 0, t, 0).astype(np.float32).reshape(view.height, view.width)
+        face = face.reshape(t.shape)
+        truth = self._truth(view, t, face)
         original = render.original_distance(self.loaded.scene, origin, rays[hit])
         tessellated = np.array([shape.plugin in TESSELLATED for shape in self.mesh.shapes])
         slack = np.where(tessellated[self.mesh.shape[on]], ROUND_DEPTH_TOLERANCE, DEPTH_TOLERANCE)
-        undisturbed = np.abs(original - t[hit]) <= slack * t[hit]
+        truth.valid.ravel()[hit] &= np.abs(original - t.ravel()[hit]) <= slack * t.ravel()[hit]
+        return t, face, truth
+
+    def _truth(self, view: View, depth: Array, face: Array, scan: Scanned | None = None) -> Truth:
+        """Return materials and emission of the mesh, or of a scan of it, where a view meets it; the radiance is still 0.
+
+        Args:
+            view: the camera.
+            depth: (H, W) z-depth in metres; face: (H, W), -1 = miss.
+            scan: its materials are those of the points of the mesh nearest to where its points were before it was bent.
+        """
+        from iif_core.surface.closest import closest_points
+        from iif_core.surface.triangles import face_geometry
+        from lab.mitsuba_scene import materials
+
+        mesh, hit, rays = scan or self.mesh, np.flatnonzero(face >= 0), view.directions().reshape(-1, 3)
+        on, rays = face.ravel()[hit], rays[hit]
+        point = view.world_from_camera[:3, 3] + depth.ravel()[hit, None].astype(np.float64) * rays
+        front = (face_geometry(mesh.vertices, mesh.faces)[0][on] * rays).sum(1) < 0
+        emission = np.where(front[:, None], mesh.emission[on], 0)
+        if scan is None:
+            weights = materials.barycentric_of(self.mesh, on, point)
+        else:
+            _, on, weights = closest_points(self.mesh.vertices, self.mesh.faces, scan.bend.undone(point))
+            weights = weights[:, 1:]
+        surface = self.table.evaluate(self.mesh, on, weights)
         two_sided = self.table.of_faces(self.mesh, "two_sided")[on]
 
         def raster(values: Array) -> Array:
@@ -257,69 +280,35 @@ class _Capture:
             out[hit] = values
             return out.reshape(view.height, view.width, *values.shape[1:])
 
-        emission = np.where(front[:, None], self.mesh.emission[on], 0)
-        truth = Truth(
+        return Truth(
             raster(surface.albedo),
             raster(surface.roughness),
             raster(surface.metallic),
             raster(emission),
             np.zeros((view.height, view.width, 3), np.float32),
-            raster(surface.truth & undisturbed & (front | two_sided)),
+            raster(surface.truth & (front | two_sided)),
         )
-        shape = (view.height, view.width)
-        return np.where(face >= 0, t, 0).reshape(shape).astype(np.float32), face.reshape(shape), truth
+
+    def _scanned(self, instance: Array) -> Scanned:
+        """Return the mesh as a scan of it would be."""
+        from lab.simulated.realism import stream
+        from lab.simulated.scanned import scanned
+
+        rng = stream(self.job.seed, "mesh")
+        return scanned(self.mesh.vertices, self.mesh.faces, instance[:, None], self.mesh.emission, rng)
 
     def _normals(self, view: View, face: Array) -> Array:
         """Return world normals towards the camera (H, W, 3), 0 where nothing is hit."""
         normal = np.where(face[..., None] >= 0, self.geometry.normals[np.maximum(face, 0)], 0)
         return np.where((normal * view.directions()).sum(-1, keepdims=True) > 0, -normal, normal)
 
-    def _photographs(self, views: list[View], radiance: Array) -> list[View]:
-        """Write sensor values (LDR) or radiance (HDR) of every view; return the views with their exposures."""
-        from lab.simulated.photographs import expose, exposures, response_curve
-        from workflow.sources.folder_scene.exposure import SharedSurface
-
-        encoded = self.settings.dynamic_range == "ldr"
-        self.response = response_curve(RESPONSE) if encoded else None
-        if encoded:
-            metered, dark = zip(*self.meter, strict=True)
-            given = exposures(metered, dark)
-            views = [replace(view, exposure=float(e)) for view, e in zip(views, given, strict=True)]
-        shared = SharedSurface(len(views), encoded)
-        for i, view in enumerate(views):
-            pixels = view.width * view.height
-            valid = np.unpackbits(self.usable[i], count=pixels).view(bool).reshape(view.height, view.width)
-            image = expose(radiance[i], view.exposure, self.response) if encoded else np.array(radiance[i])
-            self.writer.photo(view.name, image, valid, encoded)
-            if self.settings.exposure == "estimate":
-                self._share(shared, view, image, valid)
-        return self._estimated(shared, views) if self.settings.exposure == "estimate" else views
-
-    def _share(self, shared: Any, view: View, image: Array, valid: Array) -> None:
-        from iif_core.light.transport.geometry import trace
-
-        rays = view.directions()
-        face, t = trace(self.geometry, view.world_from_camera[:3, 3], rays.reshape(-1, 3))
-        hit = (face >= 0).reshape(valid.shape)
-        points = view.world_from_camera[:3, 3] + np.where(hit, t.reshape(valid.shape), 0)[..., None] * rays
-        footprint = float(np.median(t[face >= 0])) / view.fx if hit.any() else 1.0
-        shared.add(image, valid & hit, points, footprint)
-
-    def _estimated(self, shared: Any, views: list[View]) -> list[View]:
-        """Return the views with exposures estimated from their photographs, and record the true ones in the facts."""
-        gains = shared.gains()
-        self.facts["exposure_estimated"] = True
-        self.facts["exposure_truth"] = [round(view.exposure, 8) for view in views]
-        self.notes.append(f"exposures estimated from surface that views share (residual {gains.residual:.3f})")
-        return [replace(view, exposure=float(g)) for view, g in zip(views, gains.gain, strict=True)]
-
-    def _finish(self) -> None:
+    def _finish(self, found: Delivered) -> None:
         if self.dropped:
             self.notes.append(f"{self.dropped} path samples were not finite and are left out of the photographs")
-        if self.settings.denoise:
-            self.notes.append(DENOISED)
-        samples = None if self.response is None else self.response.samples()
-        self.writer.finish("mitsuba", self.settings.dynamic_range, True, self.notes, samples, self.facts)
+        self.notes += [*self.renderings.notes(), *found.notes]
+        samples = None if found.response is None else found.response.samples()
+        facts = {**self.facts, **found.facts}
+        self.writer.finish("mitsuba", self.settings.dynamic_range, True, self.notes, samples, facts)
         for note in self.notes:
             self.job.log.info("%s", note)
 
