@@ -11,8 +11,6 @@ from workflow.settings.section import Section
 
 UNGUIDED_PATHS = 3
 """Factor on the paths of photographs that are denoised without the truth (lab/docs/simulated.md#as-captured)."""
-LEAST_PATHS = 64
-"""Paths per pixel, before this factor, where fewer are asked for."""
 
 
 class Realism(Section):
@@ -64,4 +62,4 @@ class Capture(source.Capture):
 def paths(capture: dict[str, Any]) -> int:
     """Return the paths per pixel of the photographs of a (dumped) capture."""
     samples: int = capture["samples"]
-    return UNGUIDED_PATHS * max(LEAST_PATHS, samples) if (capture["realism"] or {}).get("unguided") else samples
+    return UNGUIDED_PATHS * samples if (capture["realism"] or {}).get("unguided") else samples

@@ -20,7 +20,7 @@ HOLES = 0.03
 """Share of the area that is missing."""
 HOLE = (0.03, 0.15)
 """Smallest and largest radius of a hole, metres."""
-KEPT = 0.5
+KEPT = 0.25
 """Share of the faces that decimation keeps."""
 EDGE = 0.1
 """Longest edge in metres before the mesh is bent: a fifth of the correlation length."""
@@ -47,9 +47,11 @@ class Bend:
         return np.sin(np.asarray(points, np.float64) @ self.wave.T + self.phase) @ self.size
 
     def undone(self, points: Array) -> Array:
-        """Return where bent points (n, 3) were before, to 0.1 mm: x = y - u(x), twice iterated from x = y."""
-        before = points - self(points)
-        return points - self(before)
+        """Return where bent points (n, 3) were before: x = y - u(x), iterated from x = y until 0.01 mm are right."""
+        before = points
+        for _ in range(4):
+            before = points - self(before)
+        return before
 
 
 @dataclass(frozen=True)
