@@ -19,9 +19,9 @@ ELECTRONS = 7045.0
 """That saturate a pixel at ISO 800: Nikon D800, 0.43 electrons a step of 14 bits (photonstophotos.net, D800 Read Noise)."""
 READ_ELECTRONS = 4.2
 """Standard deviation of its read noise at ISO 800, from the same table."""
-WHITE_BALANCE = 0.05
-"""Standard deviation of the log gain of red and of blue against green. The 60 photographs of Red Kitchen differ by up to 25 %
-(lab/notebook/real-scenes.md); 60 normal numbers of this deviation span 0.23 on average."""
+WHITE_BALANCE = 0.06
+"""Standard deviation of the log gain of red and of blue against green. The 24 photographs of Red Kitchen differ by up to 25 %
+(lab/notebook/real-scenes.md); the larger of the two ranges of 24 normal numbers of this deviation is 0.26 on average."""
 BLUR = 0.5
 """Standard deviation of the lens blur in pixels."""
 JPEG_QUALITY = 92
