@@ -19,6 +19,7 @@ from lab.simulated import realism, scanned
 from lab.simulated.photographs import expose, response_curve
 from lab.sources.delivery import taken
 from lab.stability.chain import run_stages
+from lab.studies import variants
 from workflow import settings
 from workflow.scene.normal_form import CaptureReader
 from workflow.settings.scene import SceneSettings, recorded
@@ -260,6 +261,15 @@ def test_ideal_captures_keep_their_fingerprints():
         kept[str(value)] = recorded(document, ("capture",))["capture"]
     assert kept["None"] == kept["ideal"] and "realism" not in kept["None"]
     assert kept["as_captured"] != kept["ideal"] and kept["as_captured"] != kept["{'noise': False}"]
+
+
+def test_studies_take_rooms_with_truth_as_they_are(repository):
+    for scene in variants.scene_overrides(repository):
+        found = settings.load(f"{scene}--s0", root=repository)
+        if found.source.kind in ("builtin", "mitsuba"):
+            assert found.capture.realism == Realism(), scene
+    ideal, quiet = (settings.load(f"kitchen--realism-{name}-s0", root=repository).capture for name in ("ideal", "noise"))
+    assert ideal.realism is None and not quiet.realism.noise and quiet.realism.mesh
 
 
 def test_paths_are_three_times_as_many_without_the_guided_denoiser():
