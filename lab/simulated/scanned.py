@@ -46,13 +46,6 @@ class Bend:
         """Return the displacement (n, 3) at points (n, 3), metres."""
         return np.sin(np.asarray(points, np.float64) @ self.wave.T + self.phase) @ self.size
 
-    def undone(self, points: Array) -> Array:
-        """Return where bent points (n, 3) were before: x = y - u(x), iterated from x = y until 0.01 mm are right."""
-        before = points
-        for _ in range(4):
-            before = points - self(before)
-        return before
-
 
 @dataclass(frozen=True)
 class Scanned:
@@ -61,14 +54,12 @@ class Scanned:
     Attributes:
         vertices: (n, 3) float32 metres; faces: (m, 3) int32.
         ids: (m, k) int32, emission: (m, 3) float32: of the face of the true mesh that each face comes from.
-        bend: what has moved the surface.
     """
 
     vertices: Array
     faces: Array
     ids: Array
     emission: Array
-    bend: Bend
 
 
 def scanned(vertices: Array, faces: Array, ids: Array, emission: Array, rng: np.random.Generator) -> Scanned:
@@ -87,8 +78,7 @@ def scanned(vertices: Array, faces: Array, ids: Array, emission: Array, rng: np.
     vertices, faces, source = refined(rows[:, :3], local.reshape(-1, 3), EDGE)
     part, whole = part[source], kinds[:, count:].any(1)
     left = clean(faces, vertices) & without_holes(vertices, faces, whole[part], HOLES, rng)
-    bend = drawn_bend(vertices, faces, rng)
-    vertices, faces, part = vertices + bend(vertices), faces[left], part[left]
+    vertices, faces, part = vertices + drawn_bend(vertices, faces, rng)(vertices), faces[left], part[left]
     fixed = whole[part]
     simple = simplify(vertices, faces[~fixed], part[~fixed], max(1, round(KEPT * int((~fixed).sum()))))
     fixed |= ~np.isin(part, simple[2])  # a part that would vanish stays as it was
@@ -102,7 +92,6 @@ def scanned(vertices: Array, faces: Array, ids: Array, emission: Array, rng: np.
         local.reshape(-1, 3).astype(np.int32),
         kind[:, :count].astype(np.int32),
         kind[:, count:].astype(np.float32),
-        bend,
     )
 
 

@@ -6,19 +6,17 @@ The photographs are path traced with the workflow's own reflectance model and wi
 from __future__ import annotations
 
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lab.sources.delivery import Delivered, Rendered, Renderings, deliver, effects, metered
+from lab.sources.delivery import Delivered, Rendered, Renderings, Surface, deliver, effects, metered
 from lab.sources.rendered import RenderedWriter
 from workflow.scene.normal_form import Truth, View
 
 if TYPE_CHECKING:
     from lab.rooms.room import Room, Scan
-    from lab.simulated.scanned import Bend
     from workflow.runtime.job import Job
 
 Array = np.ndarray
@@ -62,22 +60,16 @@ class _Capture:
         self.material = room.materials.drjit()
 
     def run(self) -> None:
-        views, scan = self._plan(), self.scan
-        bent = self._scanned() if effects(self.settings).mesh else None
-        delivered = scan if bent is None else bent[0]
-        self.writer.mesh(delivered.vertices, delivered.faces, delivered.object_id, list(delivered.names), delivered.emission)
-
-        def truth_at(view: View, depth: Array, face: Array) -> Truth:
-            return self._truth(view, depth, face, *((scan, None) if bent is None else bent))
-
+        views, scan = self._plan(), self._scanned() if effects(self.settings).mesh else self.scan
+        self.writer.mesh(scan.vertices, scan.faces, scan.object_id, list(scan.names), scan.emission)
         with tempfile.TemporaryFile() as scratch:
             shape = (len(views), self.settings.height, self.settings.width, 3)
             radiance = np.memmap(scratch, np.float32, "w+", shape=shape)
             meters = [self._view(view, radiance[i]) for i, view in enumerate(self._counted(views))]
-            rendered = Rendered(views, radiance, meters)
-            found = deliver(self.job, self.writer, rendered, (delivered.vertices, delivered.faces), truth_at)
+            rendered, surface = Rendered(views, radiance, meters), Surface(scan.vertices, scan.faces, scan.object_id)
+            found = deliver(self.job, self.writer, rendered, surface, self.scan.object_id)
             del radiance, rendered
-        self._finish(views, found, delivered)
+        self._finish(views, found, scan)
 
     def _plan(self) -> list[View]:
         width, height, every = self.settings.width, self.settings.height, self.settings.test_every
@@ -102,8 +94,8 @@ class _Capture:
         radiance[:], emits = self._render(view) if kept is None else kept[:2]
         return metered(radiance, ~emits)
 
-    def _scanned(self) -> tuple[Scan, Bend]:
-        """Return the mesh as a scan of it would be, and how it is bent."""
+    def _scanned(self) -> Scan:
+        """Return the mesh as a scan of it would be."""
         from lab.rooms.room import Scan
         from lab.simulated.realism import stream
         from lab.simulated.scanned import scanned
@@ -112,8 +104,7 @@ class _Capture:
         ids = np.column_stack([scan.object_id, scan.material_id])
         found = scanned(scan.vertices, scan.faces, ids, scan.emission, stream(self.job.seed, "mesh"))
         owner, material = found.ids.T
-        scan = Scan(found.vertices, found.faces, owner, material, scan.names, found.emission)
-        return scan, found.bend
+        return Scan(found.vertices, found.faces, owner, material, scan.names, found.emission)
 
     def _render(self, view: View) -> tuple[Array, Array]:
         """Write G-buffer and truth; return the radiance (H, W, 3) and where it shows emitters (H, W)."""
@@ -126,47 +117,30 @@ class _Capture:
         origin = view.world_from_camera[:3, 3]
         rays = view.directions().reshape(-1, 3)
         face, depth = trace(self.surface, origin, rays)
-        depth = np.where(face >= 0, depth, 0).astype(np.float32).reshape(shape)
-        face = face.reshape(shape)
-        truth = self._truth(view, depth, face, self.scan)
+        hit = face >= 0
+        depth = np.where(hit, depth, 0).astype(np.float32)
+        on = np.maximum(face, 0)
+        albedo, roughness, metallic = self.room.materials.numpy(origin + depth[:, None] * rays, self.scan.material_id[on])
+        cosine = (self.surface.normals[on] * rays).sum(1)
+        emission = np.where((hit & (cosine < 0))[:, None], self.scan.emission[on], 0)
 
         steps = direction_derivatives(view.fx, view.fy, view.world_from_camera)
         seed = int(np.random.SeedSequence([self.job.seed, view.view_id]).generate_state(1)[0])
         scene = Scene(self.geometry, self.material, self.emitters)
         paths = PathOptions(self.renderings.samples, self.room.max_bounces, seed)
-        image = render(scene, origin, rays, paths, jitter=steps).reshape(*shape, 3)
-        normal = self.surface.normals[np.maximum(face, 0)]
-        cosine = (normal.reshape(-1, 3) * rays).sum(1).reshape(shape)
-        normal = np.where((face >= 0)[..., None], -np.sign(cosine)[..., None] * normal, 0)
-        truth = replace(truth, radiance=self.renderings.denoised(image, truth.albedo, normal))
-        self.writer.rendered(view.name, depth, face, truth, {})
+        image = render(scene, origin, rays, paths, jitter=steps)
+        normal = np.where(hit[:, None], -np.sign(cosine)[:, None] * self.surface.normals[on], 0)
+        image = self.renderings.denoised(*(a.reshape(*shape, 3) for a in (image, albedo, normal)))
+        truth = Truth(
+            np.where(hit[:, None], albedo, 0).reshape(*shape, 3),
+            np.where(hit, roughness, 0).reshape(shape),
+            np.where(hit, metallic, 0).reshape(shape),
+            emission.reshape(*shape, 3),
+            image,
+            hit.reshape(shape),
+        )
+        self.writer.rendered(view.name, depth.reshape(shape), face.reshape(shape), truth, {})
         return truth.radiance, truth.emission.any(-1)
-
-    def _truth(self, view: View, depth: Array, face: Array, scan: Scan, bend: Bend | None = None) -> Truth:
-        """Return materials and emission of a mesh where a view meets it; the radiance is still 0.
-
-        Args:
-            view: the camera.
-            depth: (H, W) z-depth in metres; face: (H, W), -1 = miss.
-            scan: the mesh; bend: how it was bent, so that materials are those of the places that its points come from.
-        """
-        from iif_core.surface.triangles import face_geometry
-
-        hit, on = face >= 0, np.maximum(face, 0).ravel()
-        rays = view.directions().reshape(-1, 3)
-        points = view.world_from_camera[:3, 3] + depth.reshape(-1, 1) * rays
-        albedo, roughness, metallic = self.room.materials.numpy(
-            points if bend is None else bend.undone(points), scan.material_id[on]
-        )
-        front = (face_geometry(scan.vertices, scan.faces)[0][on] * rays).sum(1).reshape(face.shape) < 0
-        return Truth(
-            np.where(hit[..., None], albedo.reshape(*face.shape, 3), 0),
-            np.where(hit, roughness.reshape(face.shape), 0),
-            np.where(hit, metallic.reshape(face.shape), 0),
-            np.where((hit & front)[..., None], scan.emission[on].reshape(*face.shape, 3), 0),
-            np.zeros((*face.shape, 3), np.float32),
-            hit,
-        )
 
     def _finish(self, views: list[View], found: Delivered, scan: Scan) -> None:
         from lab.rooms.coverage import seen_from, surface_points

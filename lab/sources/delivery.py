@@ -3,18 +3,17 @@ errors of real captures (lab/docs/simulated.md#as-captured)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from lab.settings.capture import IDEAL, paths
 from lab.simulated.denoise import denoise_alone
 from lab.sources.rendered import DENOISED, RenderedWriter
-from workflow.artifacts.store import rgb
+from workflow.artifacts.store import ids_from_disk, rgb
 from workflow.models.denoise import denoise, require_denoiser
 from workflow.scene.normal_form import Truth, View
 
@@ -90,6 +89,14 @@ class Rendered:
         return np.unpackbits(self.usable[number], count=shape[0] * shape[1]).view(bool).reshape(shape)
 
 
+class Surface(NamedTuple):
+    """The delivered mesh: vertices (n, 3), faces (m, 3), object of each face (m,)."""
+
+    vertices: Array
+    faces: Array
+    owner: Array
+
+
 @dataclass
 class Delivered:
     """Cameras as delivered, the true response (None: radiance), and what capture.json says."""
@@ -104,16 +111,18 @@ def deliver(
     job: Job,
     writer: RenderedWriter,
     rendered: Rendered,
-    mesh: tuple[Array, Array],
-    truth_at: Callable[[View, Array, Array], Truth],
+    surface: Surface,
+    owner: Array,
 ) -> Delivered:
-    """Write photographs and cameras, and G-buffer and truth again where cameras or mesh are not the true ones.
+    """Write photographs and cameras, and G-buffers and truth again where cameras or mesh are not the true ones.
+
+    Truth stays what the photographs show. It is known where the delivered surface at the delivered camera is of the same object.
 
     Args:
         job, writer: of the capture.
         rendered: what the source has rendered with the true cameras.
-        mesh: vertices and faces as delivered.
-        truth_at: (view, z-depth (H, W), face (H, W) or -1) -> materials and emission of the delivered surface; radiance 0.
+        surface: the delivered mesh.
+        owner: object of each face of the true mesh.
     """
     from lab.simulated.photographs import response_curve
     from workflow.sources.folder_scene.exposure import SharedSurface
@@ -127,14 +136,14 @@ def deliver(
         out.views = [replace(view, exposure=float(e)) for view, e in zip(out.views, exposures, strict=True)]
     numbers = list(range(len(out.views)))  # rows of `rendered`
     if wanted.cameras or wanted.mesh or estimated:
-        room = Room.of(SimpleNamespace(vertices=mesh[0], faces=mesh[1]), job.threads)
+        room = Room.of(surface, job.threads)
         if wanted.cameras:
             numbers = _registered(job, writer, rendered, room, out)
         shared = SharedSurface(sum(view.split != "test" for view in out.views), encoded)
         for view, number in zip(out.views, numbers, strict=True):
             depth, face = room.seen(view)
             if wanted.cameras or wanted.mesh:
-                _rewrite(writer, view, depth, face, truth_at(view, depth, face))
+                _rewrite(writer, view, depth, face, surface.owner, owner)
             if view.split != "test":
                 photo, hit = np.array(rendered.radiance[number]), face >= 0
                 footprint = float(np.median(depth[hit])) / view.fx if hit.any() else 1.0
@@ -234,12 +243,15 @@ def _registered(job: Job, writer: RenderedWriter, rendered: Rendered, room: Room
     return numbers
 
 
-def _rewrite(writer: RenderedWriter, view: View, depth: Array, face: Array, truth: Truth) -> None:
-    """Write the G-buffer of a view as delivered, and the truth of the surface that it shows."""
-    true = writer.writer.channels(f"truth/{view.name}.exr")
-    known = truth.valid & (true["valid"] > 0.5) & (face >= 0)
+def _rewrite(writer: RenderedWriter, view: View, depth: Array, face: Array, owner: Array, true_owner: Array) -> None:
+    """Write the G-buffer of a view as delivered; truth is known where it shows the object that the photograph shows."""
+    names = f"gbuffer/{view.name}.exr", f"truth/{view.name}.exr"
+    was, true = (writer.writer.channels(name) for name in names)
+    true_face = ids_from_disk(was["face.id"])
+    same = (face >= 0) & (true_face >= 0) & (owner[face] == true_owner[true_face])
     writer.gbuffer(view.name, depth, face)
-    writer.truth(view.name, replace(truth, radiance=rgb(true, "radiance"), valid=known))
+    images = rgb(true, "albedo"), true["roughness"], true["metallic"], rgb(true, "emission"), rgb(true, "radiance")
+    writer.truth(view.name, Truth(*images, valid=(true["valid"] > 0.5) & same))
 
 
 def _estimated(out: Delivered, shared: Any, rendered: Rendered, numbers: Sequence[int], encoded: bool) -> None:

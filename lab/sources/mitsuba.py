@@ -9,7 +9,6 @@ from __future__ import annotations
 import tempfile
 from collections import Counter
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,7 @@ import numpy as np
 
 from iif_core.errors import InputError
 from lab.mitsuba_scene.document import referenced_files
-from lab.sources.delivery import Delivered, Rendered, Renderings, deliver, effects, metered
+from lab.sources.delivery import Delivered, Rendered, Renderings, Surface, deliver, effects, metered
 from lab.sources.rendered import RenderedWriter
 from workflow.intake.meshes import check_mesh
 from workflow.intake.pictures import check_texture
@@ -97,15 +96,17 @@ class _Capture:
         del everything
         shapes, instance = np.unique(self.mesh.shape, return_inverse=True)
         names = [self.mesh.shapes[i].name for i in shapes]
-        scan = self._scanned(instance) if effects(self.settings).mesh else None
-        mesh, ids = (self.mesh, instance.astype(np.int32)) if scan is None else (scan, scan.ids[:, 0])
-        self.writer.mesh(mesh.vertices, mesh.faces, ids, names, mesh.emission)
+        instance = instance.astype(np.int32)
+        mesh, owner = self.mesh, instance
+        if effects(self.settings).mesh:
+            mesh = self._scanned(instance)
+            owner = mesh.ids[:, 0]
+        self.writer.mesh(mesh.vertices, mesh.faces, owner, names, mesh.emission)
         with tempfile.TemporaryFile() as scratch:
             shape = (len(views), self.settings.height, self.settings.width, 3)
             radiance = np.memmap(scratch, np.float32, "w+", shape=shape)
             rendered = self._views(views, radiance)
-            truth_at = self._truth if scan is None else partial(self._truth, scan=scan)
-            found = deliver(self.job, self.writer, rendered, (mesh.vertices, mesh.faces), truth_at)
+            found = deliver(self.job, self.writer, rendered, Surface(mesh.vertices, mesh.faces, owner), instance)
             del radiance, rendered
         self._finish(found)
 
@@ -233,7 +234,7 @@ class _Capture:
     def _gbuffer(self, view: View) -> tuple[Array, Array, Truth]:
         """Return z-depth, face ids and material truth at the pixel centres; the radiance of the truth is still 0."""
         from iif_core.light.transport.geometry import trace
-        from lab.mitsuba_scene import render
+        from lab.mitsuba_scene import materials, render
 
         origin = view.world_from_camera[:3, 3]
         rays = view.directions().reshape(-1, 3)
@@ -241,38 +242,14 @@ class _Capture:
         hit = np.flatnonzero(face >= 0)
         if view.view_id == 0 and not len(hit):
             raise InputError(f"{self.source.path}: the scene's sensor sees no surface; point it into the room")
-        on, t = face[hit], np.where(face >= 0, t, 0).astype(np.float32).reshape(view.height, view.width)
-        face = face.reshape(t.shape)
-        truth = self._truth(view, t, face)
+        on = face[hit]
+        point = origin + t[hit, None].astype(np.float64) * rays[hit]
+        surface = self.table.evaluate(self.mesh, on, materials.barycentric_of(self.mesh, on, point))
+        front = (self.geometry.normals[on] * rays[hit]).sum(1) < 0
         original = render.original_distance(self.loaded.scene, origin, rays[hit])
         tessellated = np.array([shape.plugin in TESSELLATED for shape in self.mesh.shapes])
         slack = np.where(tessellated[self.mesh.shape[on]], ROUND_DEPTH_TOLERANCE, DEPTH_TOLERANCE)
-        truth.valid.ravel()[hit] &= np.abs(original - t.ravel()[hit]) <= slack * t.ravel()[hit]
-        return t, face, truth
-
-    def _truth(self, view: View, depth: Array, face: Array, scan: Scanned | None = None) -> Truth:
-        """Return materials and emission of the mesh, or of a scan of it, where a view meets it; the radiance is still 0.
-
-        Args:
-            view: the camera.
-            depth: (H, W) z-depth in metres; face: (H, W), -1 = miss.
-            scan: its materials are those of the points of the mesh nearest to where its points were before it was bent.
-        """
-        from iif_core.surface.closest import closest_points
-        from iif_core.surface.triangles import face_geometry
-        from lab.mitsuba_scene import materials
-
-        mesh, hit, rays = scan or self.mesh, np.flatnonzero(face >= 0), view.directions().reshape(-1, 3)
-        on, rays = face.ravel()[hit], rays[hit]
-        point = view.world_from_camera[:3, 3] + depth.ravel()[hit, None].astype(np.float64) * rays
-        front = (face_geometry(mesh.vertices, mesh.faces)[0][on] * rays).sum(1) < 0
-        emission = np.where(front[:, None], mesh.emission[on], 0)
-        if scan is None:
-            weights = materials.barycentric_of(self.mesh, on, point)
-        else:
-            _, on, weights = closest_points(self.mesh.vertices, self.mesh.faces, scan.bend.undone(point))
-            weights = weights[:, 1:]
-        surface = self.table.evaluate(self.mesh, on, weights)
+        undisturbed = np.abs(original - t[hit]) <= slack * t[hit]
         two_sided = self.table.of_faces(self.mesh, "two_sided")[on]
 
         def raster(values: Array) -> Array:
@@ -280,14 +257,17 @@ class _Capture:
             out[hit] = values
             return out.reshape(view.height, view.width, *values.shape[1:])
 
-        return Truth(
+        emission = np.where(front[:, None], self.mesh.emission[on], 0)
+        truth = Truth(
             raster(surface.albedo),
             raster(surface.roughness),
             raster(surface.metallic),
             raster(emission),
             np.zeros((view.height, view.width, 3), np.float32),
-            raster(surface.truth & (front | two_sided)),
+            raster(surface.truth & undisturbed & (front | two_sided)),
         )
+        shape = (view.height, view.width)
+        return np.where(face >= 0, t, 0).reshape(shape).astype(np.float32), face.reshape(shape), truth
 
     def _scanned(self, instance: Array) -> Scanned:
         """Return the mesh as a scan of it would be."""
