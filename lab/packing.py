@@ -52,7 +52,7 @@ def pack(capture: Path, folder: Path) -> list[str]:
         if reader.has_truth:
             _write_truth(reader, view, folder / "truth")
     (folder / "transforms.json").write_text(json.dumps({"camera_model": "PINHOLE", **lists, "frames": frames}, indent=1) + "\n")
-    if not reader.is_hdr:
+    if not (reader.is_hdr or reader.facts.get("exposure_estimated")):
         exposures = {frame["file_path"]: view.exposure for frame, view in zip(frames, reader.views, strict=True)}
         (folder / "exposures.json").write_text(json.dumps(exposures, indent=1) + "\n")
     _write_mesh(reader, folder / "mesh.ply")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from lab.settings.capture import paths
 from workflow.costs.work import MILLION, SceneSize, base_cells
 
 FACES_OF_ROOM = 60_000
@@ -23,7 +24,7 @@ def faces_of_files(source: dict[str, Any], faces: float) -> float:
 def rendered(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     """Count the work of stage capture that renders its photographs."""
     pixels = size.pixels / MILLION
-    counts = {"paths": pixels * settings["capture"]["samples"], "pixels": pixels, "faces": size.faces / MILLION}
+    counts = {"paths": pixels * paths(settings["capture"]), "pixels": pixels, "faces": size.faces / MILLION}
     return settings["source"]["kind"], counts
 
 

@@ -6,24 +6,21 @@ The photographs are path traced with the workflow's own reflectance model and wi
 from __future__ import annotations
 
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lab.sources.rendered import DENOISED, RenderedWriter
-from workflow.models.denoise import denoise, require_denoiser
+from lab.sources.delivery import Delivered, Rendered, Renderings, Surface, deliver, effects, metered
+from lab.sources.rendered import RenderedWriter
 from workflow.scene.normal_form import Truth, View
 
 if TYPE_CHECKING:
-    from lab.rooms.room import Room
+    from lab.rooms.room import Room, Scan
     from workflow.runtime.job import Job
 
 Array = np.ndarray
 
-RESPONSE = "filmic"
-METERING_PIXELS = 4096  # per view; their radiance sets the exposure
 COVERAGE_POINTS = 8000
 
 
@@ -39,8 +36,6 @@ def capture(job: Job) -> None:
     native.prepare()
     device.mitsuba()
     native.limit_threads(job.threads)
-    if job.settings.capture.denoise:
-        require_denoiser()
     from lab import rooms
 
     _Capture(job, rooms.build(job.settings.source.scene, job.settings.source.quarterings)).run()
@@ -54,6 +49,7 @@ class _Capture:
         from iif_core.light.transport.geometry import build_geometry
 
         self.job, self.settings, self.room = job, job.settings.capture, room
+        self.renderings = Renderings(self.settings)
         self.writer = RenderedWriter(job.writer)
         self.geometry = build_geometry(room.vertices, room.faces, room.object_id)
         front = np.ones(len(room.faces), np.int8)
@@ -64,17 +60,16 @@ class _Capture:
         self.material = room.materials.drjit()
 
     def run(self) -> None:
-        views = self._plan()
-        scan = self.scan
+        views, scan = self._plan(), self._scanned() if effects(self.settings).mesh else self.scan
         self.writer.mesh(scan.vertices, scan.faces, scan.object_id, list(scan.names), scan.emission)
         with tempfile.TemporaryFile() as scratch:
             shape = (len(views), self.settings.height, self.settings.width, 3)
             radiance = np.memmap(scratch, np.float32, "w+", shape=shape)
             meters = [self._view(view, radiance[i]) for i, view in enumerate(self._counted(views))]
-            views = self._photographs(views, radiance, meters)
-            del radiance
-        self.writer.cameras(views)
-        self._finish(views)
+            rendered, surface = Rendered(views, radiance, meters), Surface(scan.vertices, scan.faces, scan.object_id)
+            found = deliver(self.job, self.writer, rendered, surface, self.scan.object_id)
+            del radiance, rendered
+        self._finish(views, found, scan)
 
     def _plan(self) -> list[View]:
         width, height, every = self.settings.width, self.settings.height, self.settings.test_every
@@ -97,8 +92,19 @@ class _Capture:
         """Write G-buffer and truth and fill in `radiance`; return radiance and mask of the pixels for metering."""
         kept = self.writer.kept(view.name)
         radiance[:], emits = self._render(view) if kept is None else kept[:2]
-        step = max(1, emits.size // METERING_PIXELS)
-        return np.array(radiance).reshape(-1, 3)[::step], ~emits.ravel()[::step]
+        return metered(radiance, ~emits)
+
+    def _scanned(self) -> Scan:
+        """Return the mesh as a scan of it would be."""
+        from lab.rooms.room import Scan
+        from lab.simulated.realism import stream
+        from lab.simulated.scanned import scanned
+
+        scan = self.scan
+        ids = np.column_stack([scan.object_id, scan.material_id])
+        found = scanned(scan.vertices, scan.faces, ids, scan.emission, stream(self.job.seed, "mesh"))
+        owner, material = found.ids.T
+        return Scan(found.vertices, found.faces, owner, material, scan.names, found.emission)
 
     def _render(self, view: View) -> tuple[Array, Array]:
         """Write G-buffer and truth; return the radiance (H, W, 3) and where it shows emitters (H, W)."""
@@ -121,39 +127,22 @@ class _Capture:
         steps = direction_derivatives(view.fx, view.fy, view.world_from_camera)
         seed = int(np.random.SeedSequence([self.job.seed, view.view_id]).generate_state(1)[0])
         scene = Scene(self.geometry, self.material, self.emitters)
-        image = render(scene, origin, rays, PathOptions(self.settings.samples, self.room.max_bounces, seed), jitter=steps)
-        if self.settings.denoise:
-            normal = np.where(hit[:, None], -np.sign(cosine)[:, None] * self.surface.normals[on], 0)
-            image = denoise(*(a.reshape(*shape, 3) for a in (image, albedo, normal))).reshape(-1, 3)
+        paths = PathOptions(self.renderings.samples, self.room.max_bounces, seed)
+        image = render(scene, origin, rays, paths, jitter=steps)
+        normal = np.where(hit[:, None], -np.sign(cosine)[:, None] * self.surface.normals[on], 0)
+        image = self.renderings.denoised(*(a.reshape(*shape, 3) for a in (image, albedo, normal)))
         truth = Truth(
             np.where(hit[:, None], albedo, 0).reshape(*shape, 3),
             np.where(hit, roughness, 0).reshape(shape),
             np.where(hit, metallic, 0).reshape(shape),
             emission.reshape(*shape, 3),
-            image.reshape(*shape, 3),
+            image,
             hit.reshape(shape),
         )
         self.writer.rendered(view.name, depth.reshape(shape), face.reshape(shape), truth, {})
         return truth.radiance, truth.emission.any(-1)
 
-    def _photographs(self, views: list[View], radiance: Array, meters: list[tuple[Array, Array]]) -> list[View]:
-        """Write the photographs and return the views with their exposures."""
-        from lab.simulated.photographs import expose, exposures, response_curve
-
-        self.response = None
-        if self.settings.dynamic_range == "hdr":
-            for view, image in zip(views, radiance, strict=True):
-                self.writer.photo(view.name, np.array(image), encoded=False)
-            return views
-        self.response = response_curve(RESPONSE)
-        used = [view.split != "test" for view in views]
-        gains = exposures([image for image, _ in meters], [mask for _, mask in meters], used=used)
-        views = [replace(view, exposure=float(gain)) for view, gain in zip(views, gains, strict=True)]
-        for view, image in zip(views, radiance, strict=True):
-            self.writer.photo(view.name, expose(image, view.exposure, self.response))
-        return views
-
-    def _finish(self, views: list[View]) -> None:
+    def _finish(self, views: list[View], found: Delivered, scan: Scan) -> None:
         from lab.rooms.coverage import seen_from, surface_points
 
         points = surface_points(self.room, COVERAGE_POINTS)
@@ -166,12 +155,11 @@ class _Capture:
         reachable = (views_of_point > 0) | (count(self.room.cameras(len(self.room.shots)), 1.0) > 0)
         once, twice = (float((views_of_point[reachable] >= n).mean()) for n in (1, 2))
         self.job.log.info("of the visible surface %.1f %% are seen, %.1f %% twice or more", 100 * once, 100 * twice)
-        notes = [f"{len(self.scan.names)} objects, {len(self.scan.faces)} faces; up to {self.room.max_bounces} bounces"]
-        if self.response is not None:
-            notes.append(f"8-bit photographs through the response `{self.response.name}`; exposures differ")
-        if self.settings.denoise:
-            notes.append(DENOISED)
+        notes = [f"{len(scan.names)} objects, {len(scan.faces)} faces; up to {self.room.max_bounces} bounces"]
+        if found.response is not None:
+            notes.append(f"8-bit photographs through the response `{found.response.name}`; exposures differ")
+        notes += [*self.renderings.notes(), *found.notes]
         coverage = {"seen_once": round(once, 4), "seen_twice": round(twice, 4), "points": COVERAGE_POINTS}
-        facts = {"room": self.room.name, "coverage": coverage}
-        samples = None if self.response is None else self.response.samples()
+        facts = {"room": self.room.name, "coverage": coverage, **found.facts}
+        samples = None if found.response is None else found.response.samples()
         self.writer.finish("builtin", self.settings.dynamic_range, True, notes, samples, facts)

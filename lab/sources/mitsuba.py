@@ -16,20 +16,19 @@ import numpy as np
 
 from iif_core.errors import InputError
 from lab.mitsuba_scene.document import referenced_files
-from lab.sources.rendered import DENOISED, RenderedWriter
+from lab.sources.delivery import Delivered, Rendered, Renderings, Surface, deliver, effects, metered
+from lab.sources.rendered import RenderedWriter
 from workflow.intake.meshes import check_mesh
 from workflow.intake.pictures import check_texture
-from workflow.models.denoise import denoise, require_denoiser
 from workflow.scene.normal_form import Truth, View
 
 if TYPE_CHECKING:
+    from lab.simulated.scanned import Scanned
     from workflow.runtime.job import Job
 
 Array = np.ndarray
 
 FIELD_OF_VIEW = 75.0  # degrees across the wider side, for all views except the scene's own
-RESPONSE = "filmic"
-METERING_PIXELS = 4096  # per view; their radiance sets the exposure
 DEPTH_TOLERANCE = 1e-4
 """Relative difference of depth between mesh and original surface above which a pixel has no truth (glass in between)."""
 ROUND_DEPTH_TOLERANCE = 0.01
@@ -59,8 +58,6 @@ def capture(job: Job) -> None:
     native.prepare()
     device.mitsuba()
     native.limit_threads(job.threads)
-    if job.settings.capture.denoise:
-        require_denoiser()
     _Capture(job).run()
 
 
@@ -70,6 +67,7 @@ class _Capture:
     def __init__(self, job: Job):
         self.job, self.settings, self.source = job, job.settings.capture, job.settings.source
         self.writer = RenderedWriter(job.writer)
+        self.renderings = Renderings(self.settings)
 
     def run(self) -> None:
         import mitsuba as mi
@@ -98,15 +96,19 @@ class _Capture:
         del everything
         shapes, instance = np.unique(self.mesh.shape, return_inverse=True)
         names = [self.mesh.shapes[i].name for i in shapes]
-        self.writer.mesh(self.mesh.vertices, self.mesh.faces, instance.astype(np.int32), names, self.mesh.emission)
+        instance = instance.astype(np.int32)
+        mesh, owner = self.mesh, instance
+        if effects(self.settings).mesh:
+            mesh = self._scanned(instance)
+            owner = mesh.ids[:, 0]
+        self.writer.mesh(mesh.vertices, mesh.faces, owner, names, mesh.emission)
         with tempfile.TemporaryFile() as scratch:
             shape = (len(views), self.settings.height, self.settings.width, 3)
             radiance = np.memmap(scratch, np.float32, "w+", shape=shape)
-            self._views(views, radiance)
-            views = self._photographs(views, radiance)
-            del radiance
-        self.writer.cameras(views)
-        self._finish()
+            rendered = self._views(views, radiance)
+            found = deliver(self.job, self.writer, rendered, Surface(mesh.vertices, mesh.faces, owner), instance)
+            del radiance, rendered
+        self._finish(found)
 
     # ------------------------------------------------------------------------------------------------------ scene
 
@@ -196,15 +198,14 @@ class _Capture:
 
     # ------------------------------------------------------------------------------------------------------ views
 
-    def _views(self, views: list[View], radiance: Array) -> None:
+    def _views(self, views: list[View], radiance: Array) -> Rendered:
         """Write G-buffer and truth of every view and fill in `radiance`, from which the photographs are made."""
         from lab.mitsuba_scene import render
 
         integrator = render.path_integrator(self.source.max_bounces)
         render.balance_lights(self.loaded.scene, self.loaded.scene.shapes())
         self.dropped = 0
-        self.usable: list[Array] = []
-        self.meter: list[tuple[Array, Array]] = []
+        out = Rendered(views, radiance, [], [])
         for i, view in enumerate(views):
             kept = self.writer.kept(view.name)
             image, emits, facts = self._render(view, integrator) if kept is None else kept
@@ -212,11 +213,10 @@ class _Capture:
             valid = np.ones(image.shape[:2], bool)
             valid.ravel()[facts["invalid"]] = False
             radiance[i] = image
-            self.usable.append(np.packbits(valid))
-            step = max(1, image.shape[0] * image.shape[1] // METERING_PIXELS)
-            dark = (valid & ~emits).ravel()[::step]
-            self.meter.append((image.reshape(-1, 3)[::step], dark))
+            out.usable.append(np.packbits(valid))
+            out.meters.append(metered(image, valid & ~emits))
             self.job.progress(i + 1, len(views), "rendered views")
+        return out
 
     def _render(self, view: View, integrator: Any) -> tuple[Array, Array, dict[str, Any]]:
         """Write G-buffer and truth of a view; return its radiance (H, W, 3), where it shows emitters (H, W), and what else is
@@ -224,9 +224,9 @@ class _Capture:
         from lab.mitsuba_scene import render
 
         depth, face, truth = self._gbuffer(view)
-        image, valid, dropped = render.render_view(self.loaded.scene, integrator, view, self.settings.samples, self.job.seed)
-        if self.settings.denoise:
-            image = denoise(image, truth.albedo, self._normals(view, face))
+        samples = self.renderings.samples
+        image, valid, dropped = render.render_view(self.loaded.scene, integrator, view, samples, self.job.seed)
+        image = self.renderings.denoised(image, truth.albedo, self._normals(view, face))
         facts = {"dropped": dropped, "invalid": np.flatnonzero(~valid).tolist()}
         self.writer.rendered(view.name, depth, face, replace(truth, radiance=image), facts)
         return image, truth.emission.any(-1), facts
@@ -269,60 +269,26 @@ class _Capture:
         shape = (view.height, view.width)
         return np.where(face >= 0, t, 0).reshape(shape).astype(np.float32), face.reshape(shape), truth
 
+    def _scanned(self, instance: Array) -> Scanned:
+        """Return the mesh as a scan of it would be."""
+        from lab.simulated.realism import stream
+        from lab.simulated.scanned import scanned
+
+        rng = stream(self.job.seed, "mesh")
+        return scanned(self.mesh.vertices, self.mesh.faces, instance[:, None], self.mesh.emission, rng)
+
     def _normals(self, view: View, face: Array) -> Array:
         """Return world normals towards the camera (H, W, 3), 0 where nothing is hit."""
         normal = np.where(face[..., None] >= 0, self.geometry.normals[np.maximum(face, 0)], 0)
         return np.where((normal * view.directions()).sum(-1, keepdims=True) > 0, -normal, normal)
 
-    def _photographs(self, views: list[View], radiance: Array) -> list[View]:
-        """Write sensor values (LDR) or radiance (HDR) of every view; return the views with their exposures."""
-        from lab.simulated.photographs import expose, exposures, response_curve
-        from workflow.sources.folder_scene.exposure import SharedSurface
-
-        encoded = self.settings.dynamic_range == "ldr"
-        self.response = response_curve(RESPONSE) if encoded else None
-        if encoded:
-            metered, dark = zip(*self.meter, strict=True)
-            given = exposures(metered, dark, used=[view.split != "test" for view in views])
-            views = [replace(view, exposure=float(e)) for view, e in zip(views, given, strict=True)]
-        own = [i for i, view in enumerate(views) if view.split != "test"]
-        shared = SharedSurface(len(own), encoded)
-        for i, view in enumerate(views):
-            pixels = view.width * view.height
-            valid = np.unpackbits(self.usable[i], count=pixels).view(bool).reshape(view.height, view.width)
-            image = expose(radiance[i], view.exposure, self.response) if encoded else np.array(radiance[i])
-            self.writer.photo(view.name, image, valid, encoded)
-            if self.settings.exposure == "estimate" and i in own:
-                self._share(shared, view, image, valid)
-        return self._estimated(shared, views, own) if self.settings.exposure == "estimate" else views
-
-    def _share(self, shared: Any, view: View, image: Array, valid: Array) -> None:
-        from iif_core.light.transport.geometry import trace
-
-        rays = view.directions()
-        face, t = trace(self.geometry, view.world_from_camera[:3, 3], rays.reshape(-1, 3))
-        hit = (face >= 0).reshape(valid.shape)
-        points = view.world_from_camera[:3, 3] + np.where(hit, t.reshape(valid.shape), 0)[..., None] * rays
-        footprint = float(np.median(t[face >= 0])) / view.fx if hit.any() else 1.0
-        shared.add(image, valid & hit, points, footprint)
-
-    def _estimated(self, shared: Any, views: list[View], own: list[int]) -> list[View]:
-        """Return the views with exposures estimated from the photographs `own`, and record the true ones in the facts. The others
-        are held out and have 1, because scoring estimates theirs."""
-        gains = shared.gains()
-        self.facts["exposure_estimated"] = True
-        self.facts["exposure_truth"] = [round(view.exposure, 8) for view in views]
-        self.notes.append(f"exposures estimated from surface that views share (residual {gains.residual:.3f})")
-        found = dict(zip(own, gains.gain, strict=True))
-        return [replace(view, exposure=float(found.get(i, 1.0))) for i, view in enumerate(views)]
-
-    def _finish(self) -> None:
+    def _finish(self, found: Delivered) -> None:
         if self.dropped:
             self.notes.append(f"{self.dropped} path samples were not finite and are left out of the photographs")
-        if self.settings.denoise:
-            self.notes.append(DENOISED)
-        samples = None if self.response is None else self.response.samples()
-        self.writer.finish("mitsuba", self.settings.dynamic_range, True, self.notes, samples, self.facts)
+        self.notes += [*self.renderings.notes(), *found.notes]
+        samples = None if found.response is None else found.response.samples()
+        facts = {**self.facts, **found.facts}
+        self.writer.finish("mitsuba", self.settings.dynamic_range, True, self.notes, samples, facts)
         for note in self.notes:
             self.job.log.info("%s", note)
 

@@ -11,7 +11,7 @@ pytestmark = pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reas
 DENOISED = """
 import sys
 import numpy as np
-from lab.published.stages.shading import denoise_alone
+from lab.simulated.denoise import denoise_alone
 from workflow.models.denoise import denoise
 
 noisy = np.random.default_rng(0).exponential(1.0, (64, 64, 3)).astype(np.float32)

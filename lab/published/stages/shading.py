@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from iif_core.camera.pixels import ViewPixels
+from lab.simulated.denoise import denoise_alone
 from workflow.artifacts.store import split_rgb
-from workflow.models.denoise import _oidn, require_denoiser
+from workflow.models.denoise import require_denoiser
 from workflow.runtime import device
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_lit_scene, read_radiance_cache
@@ -88,8 +89,3 @@ def _denoised(values: np.ndarray, index: np.ndarray, view: View) -> np.ndarray:
     image = np.zeros((view.height * view.width, 3), np.float32)
     image[index] = values
     return denoise_alone(image.reshape(view.height, view.width, 3)).reshape(-1, 3)[index]
-
-
-def denoise_alone(radiance: np.ndarray) -> np.ndarray:
-    """Denoise a linear HDR picture (H, W, 3) without guides."""
-    return np.maximum(_oidn().denoise(np.ascontiguousarray(radiance, np.float32), hdr=True), 0)
