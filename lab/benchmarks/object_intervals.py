@@ -314,7 +314,14 @@ def document(rooms: Sequence[Room], found: Sequence[Mapping[str, float]], errors
         held[name]["half_width"] = float(np.nanmean([row[width] for row in found]))
     numbers = {name: float(f"{value:.4g}") for name, value in vars(errors).items()}
     held = {name: {key: round(value, 4) for key, value in entry.items()} for name, entry in held.items()}
-    return {"errors": numbers, "held": held, "rooms": [room.scene for room in rooms]}
+    metals, inside = _metals(found)
+    return {"errors": numbers, "held": held, "metals": {"true": metals, "held": inside}, "rooms": [room.scene for room in rooms]}
+
+
+def _metals(found: Sequence[Mapping[str, float]]) -> tuple[int, int]:
+    """Return how many objects are metal, and of how many of them the interval of metallic holds that."""
+    held = sum(row["metals"] * np.nan_to_num(row["metals_held"]) for row in found)
+    return round(sum(row["metals"] for row in found)), round(held)
 
 
 def tables(rooms: Sequence[Room], found: Sequence[Mapping[str, float]], errors: MeasuredErrors) -> dict[str, str]:
@@ -346,10 +353,9 @@ def tables(rooms: Sequence[Room], found: Sequence[Mapping[str, float]], errors: 
         "level of the room, error ± half of 95 %",
     ]
     heads += ["half width: R, G, B", "relative, of the surface", "roughness", "roughness claimed of"]
-    metals = sum(row["metals"] for row in found)
-    held = sum(row["metals"] * np.nan_to_num(row["metals_held"]) for row in found)
+    metals, held = _metals(found)
     numbers = [[name, f"{value:.3g}"] for name, value in vars(errors).items()]
-    numbers += [["true metals that their interval holds", f"{held:.0f} of {metals:.0f}"]]
+    numbers += [["true metals that their interval holds", f"{held} of {metals}"]]
     level = [room.level_error for room in rooms]
     numbers += [["level of the room: mean error, and root mean square in claimed errors", _level(level, rooms)]]
     return {

@@ -19,7 +19,8 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 def measured() -> dict[str, Any]:
     """Return the document: `errors` (`iif_core.fitting.intervals.MeasuredErrors`), `rooms` from which they are, and of each
     quantity in `held` the share of the objects whose truth an interval held that other rooms had made: the mean over rooms
-    (`pooled`), and the `lowest` and `highest`. Of roughness, objects with an interval of 0 to 1 do not count."""
+    (`pooled`), and the `lowest` and `highest`. Of roughness, objects with an interval of 0 to 1 do not count. `metals`: how
+    many objects were metal, and of how many of these the interval of metallic held that."""
     return json.loads(FILE.read_text())
 
 
