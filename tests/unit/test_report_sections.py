@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.errors import named
 from workflow.decisions import held
 from workflow.report import scores, views
 from workflow.report.emitters import emitter_note, emitter_rows
@@ -104,9 +105,12 @@ def test_materials_that_most_pixels_show_come_first():
 def test_what_intervals_held_is_what_was_measured(monkeypatch):
     shares = {"pooled": 0.951, "lowest": 0.874, "highest": 1.0}
     document = {"held": {name: shares for name in ("albedo", "roughness", "metallic")}, "rooms": ["a", "b"]}
+    document["metals"] = {"true": 71, "held": 43}
     monkeypatch.setattr(held, "measured", lambda: document)
     assert held.words("albedo") == "95 % (87 to 100 % in a room)" and held.rooms() == 2
-    assert intervals_note().count(held.words("albedo")) == 3
+    note = intervals_note()
+    assert note.count(held.words("albedo")) == 3
+    named(note, 71, 43)
 
 
 def test_lamps_are_told_by_their_power():
