@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,6 +51,18 @@ class EmissionPixels(Rows):
         else:
             out[own, : self.coverage.shape[1]] = self.coverage[own]
         return out
+
+    def with_majority(self, groups: int) -> EmissionPixels:
+        """Return the pixels, all that look at a group being lower bounds in the channels in which more than half of them are.
+
+        Compression, blur, noise and wrong poses lower some of the pixels of a saturated lamp to below saturation. They would be
+        taken for its radiance, against everything that the other pixels say; what they show is still less than it.
+        """
+        own, bound = self.group >= 0, self.bound.copy()
+        count = np.bincount(self.group[own], minlength=groups)[:, None]
+        bounded = np.stack([np.bincount(self.group[own], bound[own, c], groups) for c in range(3)], 1)
+        bound[own] |= (2 * bounded > count)[self.group[own]]
+        return replace(self, bound=bound)
 
     @property
     def own_share(self) -> np.ndarray:
