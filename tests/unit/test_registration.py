@@ -48,6 +48,7 @@ def test_a_common_shift_of_the_principal_point_is_found(photos: list[Photo]) -> 
     assert found.accepted
     np.testing.assert_allclose(found.principal * FOCAL, [2.0, -1.5], atol=0.3)
     assert abs(found.focal - 1) < 0.01
+    np.testing.assert_allclose(found.moved, 2.5, atol=0.3)  # every pixel moves by the hypotenuse
 
 
 def test_what_is_right_is_left_alone(photos: list[Photo]) -> None:
