@@ -238,14 +238,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--resume", action="store_true", help="keep the rows of the table; leave out what it holds of this seed")
     options = parser.parse_args(arguments)
     rows = list(csv.reader(TABLE.read_text().splitlines(True))) if options.resume and TABLE.exists() else [COLUMNS]
-    done, verdicts = {tuple(row[:2]) for row in rows}, []
+    done, verdicts = {(row[0], *row[2:7]) for row in rows}, []
     with tempfile.TemporaryDirectory() as scratch, TABLE.open("w", newline="") as file:
         subprocess.run(["git", "clone", "-q", "--shared", str(REPOSITORY), f"{scratch}/copy"], check=True)
         table, bench = csv.writer(file, lineterminator="\n"), Bench(Path(scratch) / "copy")
         table.writerows(rows)
         drawn = [(number, one) for number, one in enumerate(draw(bench.root, options.seed)) if options.only in one.file]
         for number, mutant in drawn[: options.count]:
-            if (str(options.seed), str(number)) not in done:
+            if tuple(map(str, (options.seed, *astuple(mutant)[:5]))) not in done:
                 verdict, by, seconds = bench.verdict(mutant)
                 verdicts.append(verdict)
                 table.writerow([options.seed, number, *astuple(mutant)[:5], verdict, by, f"{seconds:.1f}"])
