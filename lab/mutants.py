@@ -1,6 +1,6 @@
 """`python -m lab.mutants`: does a unit test fail when a line that numbers pass through is wrong?
 
-    python -m lab.mutants --count 300 --seed 0             # 300 lines of all modules; --resume keeps what the table holds
+    python -m lab.mutants --count 300 --seed 0             # 300 lines of all modules; --resume leaves out what was tried
     python -m lab.mutants --count 20 --only fusion/gauge   # of files whose path contains this text
 
 A mutant is the last commit with one operator, sign, constant or argument changed. It is killed if one of the unit tests closest
@@ -235,14 +235,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="files whose path contains this text")
-    parser.add_argument("--resume", action="store_true", help="keep the rows of the table; leave out what it holds of this seed")
+    parser.add_argument("--resume", action="store_true", help="leave out what the table holds of this seed")
     options = parser.parse_args(arguments)
-    rows = list(csv.reader(TABLE.read_text().splitlines(True))) if options.resume and TABLE.exists() else [COLUMNS]
-    done, verdicts = {(row[0], *row[2:7]) for row in rows}, []
-    with tempfile.TemporaryDirectory() as scratch, TABLE.open("w", newline="") as file:
+    rows = list(csv.reader(TABLE.read_text().splitlines(True))) if TABLE.exists() else []
+    done, verdicts = {(row[0], *row[2:7]) for row in rows if options.resume}, []
+    with tempfile.TemporaryDirectory() as scratch, TABLE.open("a", newline="") as file:
         subprocess.run(["git", "clone", "-q", "--shared", str(REPOSITORY), f"{scratch}/copy"], check=True)
         table, bench = csv.writer(file, lineterminator="\n"), Bench(Path(scratch) / "copy")
-        table.writerows(rows)
+        table.writerows([] if rows else [COLUMNS])
         drawn = [(number, one) for number, one in enumerate(draw(bench.root, options.seed)) if options.only in one.file]
         for number, mutant in drawn[: options.count]:
             if tuple(map(str, (options.seed, *astuple(mutant)[:5]))) not in done:
