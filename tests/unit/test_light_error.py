@@ -47,8 +47,8 @@ def test_too_little_to_compare():
 
 
 def test_light_is_read_at_the_true_roughness(monkeypatch):
-    """Light that is linear in the roughness, and the means of halves that differ, give the true radiance again. What does
-    not count is left out: pixels without specular light, invalid ones, what shines, borders, no surface, what lets light through."""
+    """Light that is linear in the roughness, and the means of halves that differ, give the true radiance again. Left out are
+    pixels without specular light, invalid ones, what shines, borders, holes, and what lets light through."""
     rng = np.random.default_rng(1)
     levels, shape = np.array([0.1, 0.4, 1.0]), (4, 5)
     face, object_id = np.arange(20).reshape(shape) % 7, np.arange(20).reshape(shape) % 3
