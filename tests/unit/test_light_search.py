@@ -1,6 +1,7 @@
 """The search for the light of a room, on photographs in memory whose light is known."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -107,6 +108,22 @@ def test_rays_from_no_surface(closed):
 def test_light_that_no_camera_ray_brings_has_no_brightness(closed):
     _, share, brightness = escaping_light(closed[0])
     assert share == 0 and brightness is None
+
+
+def test_share_and_brightness_of_escaping_light():
+    """Two views: of 20 and 30 rays, 4 and 6 escape, of radiance 3; the valid pixels of surface show 0.5 and 1."""
+
+    def record(count, escaping, level):
+        pixels = SimpleNamespace(valid=np.arange(count - escaping) > 1, value=np.full((count - escaping, 3), level), index=None)
+        empty = {"escaping": None, "escaping_share": None, "escaping_direction": np.tile([0, 0, 1.0], (escaping, 1))}
+        return SimpleNamespace(pixels=pixels, counted=count, escaping_value=np.full((escaping, 3), 3.0), **empty)
+
+    log = SimpleNamespace(progress=lambda *_: None)
+    records = [record(20, 4, 0.5), record(30, 6, 1.0)]
+    photos = SimpleNamespace(views=[0, 1], records=records, log=log, radiance=lambda view, value, index: (value, value > 9))
+    sky, share, brightness = escaping_light(photos)
+    assert sky.pixels == 10 and share == 10 / 50
+    assert brightness == pytest.approx(3 * (14 + 22) / (14 * 0.5 + 22 * 1.0))
 
 
 def test_rows_are_of_pixels_that_show_one_thing(closed):
