@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,6 +9,7 @@ from iif_core.evaluation import flip
 from iif_core.evaluation import metrics as m
 from tests.errors import refused
 from tests.oracles import scores as single
+from workflow.scoring.of_views import summary
 
 ALL = np.ones((24, 32), bool)
 
@@ -259,3 +262,17 @@ def test_mirror_threshold(roughness, counts):
     ones = np.ones((1, 1))
     masks = m.material_masks(ones > 0, ones > 0, np.zeros((1, 1, 3)), ones * roughness)
     assert bool(masks["albedo"][0, 0]) is counts
+
+
+def test_the_gain_over_raw_predictions_is_a_difference_of_decibels_and_a_ratio_of_errors():
+    def scores(psnr, l2):
+        return {"raw": {"psnr": {"mean": psnr}, "l2": {"mean": l2}}}
+
+    result = {"albedo": scores(23.5, 0.01), "roughness": scores(18.0, 0.0), "metallic": {"raw": {"lpips": {"mean": 0.1}}}}
+    prior = {"albedo": scores(20.25, 0.03), "roughness": scores(17.0, 0.02), "metallic": scores(9.0, 0.2)}
+    capture = SimpleNamespace(has_truth=True, views=[0, 1, 2])
+    rows = SimpleNamespace(means=lambda: {"result": result, "prior_mean_k": prior}, missing=[])
+    gains = summary(rows, capture, 2)["gain_over_raw_predictions"]
+    assert gains == {"albedo": {"raw": {"psnr_db": 3.25, "l2_ratio": 3.0}}, "roughness": {"raw": {"psnr_db": 1.0}}}
+    alone = SimpleNamespace(means=lambda: {"result": result}, missing=[])
+    assert summary(alone, capture, 2)["gain_over_raw_predictions"] == {}
