@@ -37,8 +37,8 @@ MODULES = (
     "workflow/priors/*.py", "workflow/scoring/*.py", "workflow/segmentations/*.py",
 )  # fmt: skip
 """Files whose lines are drawn. Kernels of light transport are left out: compiling a changed one takes minutes."""
-MOST_FILES, FARTHEST = 6, 3
-"""Test files that are run for a file, and imports by which they reach it, one after the other."""
+FEWEST_FILES, FARTHEST = 6, 3
+"""Test files that are run for a file: all that import it, or this many that reach it by this many imports in a row."""
 SOON, PATIENCE = 60.0, 4.0
 """Seconds, and times what the unchanged code takes, until a mutant counts as hung."""
 GUARD = 1e-6
@@ -153,7 +153,10 @@ def tests_by_file(root: Path) -> dict[str, list[str]]:
             reached |= new
             for one in new:  # of tests as close, the one with fewer imports is about fewer modules
                 found.setdefault(places[one], []).append((steps, len(imports[name]), places[name]))
-    return {file: [test for *_, test in sorted(ranks)[:MOST_FILES]] for file, ranks in found.items()}
+    return {
+        file: [test for place, (far, _, test) in enumerate(sorted(ranks)) if far == 1 or place < FEWEST_FILES]
+        for file, ranks in found.items()
+    }
 
 
 def _imported(path: Path) -> set[str]:

@@ -77,6 +77,16 @@ def test_a_mutant_is_killed_where_a_test_fails_and_survives_where_none_does(chec
     assert trial(checkout, 2, "iif_core/fusion/alone.py")[0] == "survived"
 
 
+def test_the_tests_of_a_file_are_all_that_import_it_and_else_the_closest(checkout):
+    test = (checkout / "tests/unit/test_tiny.py").read_text()
+    for number in range(9):
+        (checkout / f"tests/unit/test_also{number}.py").write_text(test)
+        (checkout / f"tests/unit/test_near{number}.py").write_text("from iif_core.fusion import tiny\n")
+    found = mutants.tests_by_file(checkout)
+    assert found["iif_core/fusion/tiny.py"] == [f"tests/unit/test_near{number}.py" for number in range(9)]
+    assert len(found["iif_core/fusion/passed.py"]) == 10 and "iif_core/fusion/alone.py" not in found
+
+
 def test_a_mutant_that_never_ends_is_killed(checkout, monkeypatch):
     monkeypatch.setattr(mutants, "SOON", 0.1)
     assert trial(checkout, 11) == ("killed", "time limit")

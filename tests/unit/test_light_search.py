@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from iif_core.light.emission import photographs
 from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.find import find_light, look_around
 from iif_core.light.emission.groups import EmitterGroups
@@ -138,6 +139,23 @@ def test_rows_are_of_pixels_that_show_one_thing(closed):
     assert 0 < (thin.group < 0).sum() <= 3 * -(-photos.options.rows // 16) < (rows.group < 0).sum()
     again = choose_rows(blind, look.groups, look.threshold)[0]
     np.testing.assert_array_equal(again.number, pixels.number)
+
+
+def test_a_pixel_of_the_cache_is_a_bound_if_any_channel_is_saturated(monkeypatch):
+    monkeypatch.setattr(photographs, "cache_origin", lambda scene, edge: np.zeros(3))
+    value = np.array([[0.2, 0.2, 0.2], [0.2, 1.0, 0.2], [1.0, 1.0, 1.0], [0.2, 0.3, np.nan]])
+    pixels = SimpleNamespace(
+        value=value, index=None, points=np.arange(4)[:, None] + 0.5 * np.ones(3), face=np.arange(4),
+        valid=np.ones(4, bool), interior=np.ones(4, bool),
+    )  # fmt: skip
+    photos = SimpleNamespace(
+        options=SimpleNamespace(cache_edge=1.0), views=[0], records=[SimpleNamespace(pixels=pixels)], scene=None,
+        radiance=lambda view, value, index: (2 * value, value >= 1), log=SimpleNamespace(progress=lambda *_: None),
+    )  # fmt: skip
+    voxels, face = photographs.Photographs.cache_pixels.func(photos)
+    np.testing.assert_array_equal(face, [0, 1, 2])
+    np.testing.assert_array_equal(voxels.censored, [False, True, True])
+    np.testing.assert_array_equal(voxels.radiance, 2 * value[:3])
 
 
 def test_lamps_are_in_no_voxel_of_the_cache(closed):
