@@ -4,7 +4,7 @@
 of a screening, `relighting` keeps the rows of that study and makes its page, `stability` measures numerical errors or collects
 them, `points` takes points of speed and accuracy from a study, `claims` takes from the study `regret` what is expected of
 decisions, `costs` fits the cost of jobs again, and `pack <capture> <folder>` makes a folder scene of a capture. `python -m
-lab.prior` and `python -m lab.freeze` have their own commands.
+lab.prior`, `python -m lab.freeze` and `python -m lab.mutants` have their own commands.
 """
 
 from __future__ import annotations

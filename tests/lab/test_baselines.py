@@ -191,6 +191,21 @@ def test_camera_response_from_cells_under_varied_light(params):
     assert fit.history[-1] < 0.1 * fit.history[0]
 
 
+def test_weights_of_the_fits_in_whose_style_it_is():
+    """FIPT: 5e-4 (1 - r + m) and 5e-3 of the distance from the mean of the part; IRIS adds 1e-2 of the squared distance of a."""
+    rows, object_id, objects, truth, curve = plant(cells=4, objects=1)
+    problem = collect(rows, object_id, objects, curve)
+    value = np.c_[np.full((4, 3), 0.4), [0.2, 0.6, 0.6, 0.6], [0.0, 1.0, 1.0, 1.0]]
+    prior = np.full((4, 3), 0.7)
+    data = judge.losses(problem, value, FREE)
+    for options, weight in ((FIPT, 0.0), (IRIS, 1e-2)):
+        mean = np.average(value[:, 3:], axis=0, weights=judge.part_weights(problem, value, options))
+        away = np.abs(value[:, 3:] - mean).sum(1)
+        pull = 5e-4 * (1 - value[:, 3] + value[:, 4]) + 5e-3 * away + weight * (2 * 0.4 - 0.7) ** 2
+        found = judge.losses(problem, value, options, prior, scale=2.0) - data
+        np.testing.assert_allclose(found, (problem.pixels * pull).sum(), rtol=1e-6)
+
+
 def test_camera_without_parameters_or_pixels_stays():
     rows, object_id, objects, truth, _ = plant(cells=20)
     sums = CellSums(object_id, objects, LEVELS)

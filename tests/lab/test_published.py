@@ -1,5 +1,7 @@
 """The published method: light of one bounce, its descent to emitters, its descent to materials (lab/docs/published.md)."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from iif_core.camera.response import response
 from iif_core.fitting.problem import FitProblem
 from lab.published.fitting import descent as fitting
 from lab.published.light import descent as emission
+from lab.published.stages import emission as emission_stage
 from lab.published.stages import plan as published_plan
 from tests.unit import planted_fit as planted
 from tests.unit import transport_rooms as rooms
@@ -267,3 +270,29 @@ def test_the_published_method_is_not_planned():
     assert of["specular"]["status"] == SETTLED and of["environment"]["status"] == PROVISIONAL
     later = plan.later(False, True, set(of))
     assert not {item["component"] for item in later} & set(of)
+
+
+@pytest.mark.parametrize(("solver", "bright"), [("published", [1]), ("published_repaired", [])])
+def test_the_cache_holds_radiance_whatever_the_exposure(monkeypatch, solver, bright):
+    """Two photographs of the same three triangles, of radiance 0.2, 1.2, 0.8, exposed by 0.5 and 0.25: nothing is saturated."""
+    radiance, exposure, curve = np.array([0.2, 1.2, 0.8]), np.array([0.5, 0.25]), response("gamma", [2.0])
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 1]])
+
+    class Decoded:
+        def __init__(self, *_):
+            pass
+
+        def pixels(self, view, _):
+            value = curve(exposure[view] * radiance[:, None] * np.ones(3))
+            fields = {"points": points, "value": value, "face": np.arange(3), "index": np.arange(3), "valid": np.ones(3, bool)}
+            return SimpleNamespace(**fields, take=lambda rows: SimpleNamespace(**{k: v[rows] for k, v in fields.items()}))
+
+    monkeypatch.setattr(emission_stage, "DecodedViews", Decoded)
+    settings = SimpleNamespace(emission=SimpleNamespace(solver=solver))
+    job = SimpleNamespace(read=lambda _: None, settings=settings, progress=lambda *_: None)
+    capture, scene = SimpleNamespace(used=[0, 1]), SimpleNamespace(faces=np.zeros((3, 3)), normals=None)
+    pool, cache, shine, count = emission_stage._read(job, capture, scene, exposure, curve)
+    np.testing.assert_allclose(np.sort(cache.radiance[:, 0]), np.sort(radiance), rtol=1e-5)
+    np.testing.assert_array_equal(np.flatnonzero(shine), bright)
+    np.testing.assert_array_equal(count, 2)
+    np.testing.assert_array_equal(pool.view, np.repeat([0, 1], 3))

@@ -435,6 +435,8 @@ def test_interpolation_is_exact_at_levels_and_clamped_outside():
         np.testing.assert_allclose(interpolate_levels(s, LEVELS, np.full(10, LEVELS[j]))[0], s[:, j], atol=1e-12)
     np.testing.assert_allclose(interpolate_levels(s, LEVELS, np.full(10, 7.0))[0], s[:, -1])
     np.testing.assert_allclose(interpolate_levels(s, LEVELS, np.full(10, -7.0))[0], s[:, 0])
+    flat = interpolate_levels(np.repeat(s[:, :1], 10, 1), LEVELS, np.linspace(0, 1, 10))  # no slope, as where no light arrives
+    np.testing.assert_allclose(flat, [s[:, 0], 0 * s[:, 0]], atol=1e-12)
 
 
 def test_same_bytes_twice():

@@ -1,13 +1,23 @@
 """Claimed errors of the material fit, and parts of a system that are summed on their own."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from iif_core.camera.response import response
+from iif_core.fitting import covariance
 from iif_core.fitting.covariance import _correct_leverage
-from iif_core.fitting.descent import DescentState, decompose_objects, descend, eliminate_objects, make_response_prior
+from iif_core.fitting.descent import (
+    Arrowhead,
+    DescentState,
+    GaussianPrior,
+    decompose_objects,
+    descend,
+    eliminate_objects,
+    make_response_prior,
+)
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.pixels import evaluate, prepare_pixels
 from iif_core.fitting.population import ProfiledRoughness, initial_population, population_prior, with_profiled_roughness
@@ -56,6 +66,26 @@ def test_leverage_of_the_response():
         grown = (vectors @ np.diag(values**-0.5) @ np.linalg.inv(vectors) @ scores[k]).real
         np.testing.assert_allclose(alone[k], inverse @ grown[:16], rtol=1e-5, atol=1e-7)
         np.testing.assert_allclose(reduced[k], grown[16:] - coupling[0].T @ inverse @ grown[:16], rtol=1e-5, atol=1e-6)
+
+
+def test_few_clusters_enlarge_the_covariance(monkeypatch):
+    """n clusters of the same curvature have nu = n, so Eq. M.39 is (1 + 1 / 2n)^2 B' S B / (1 - 1 / n), S the sum of u_k u_k'."""
+    rng = np.random.default_rng(3)
+    for n in (2, 5, 40):
+        scores = np.c_[rng.normal(size=(n, 16)), np.zeros(n)]
+        h = np.zeros((n, 17, 17))
+        h[:, :16, :16] = 4.0 * np.eye(16)
+        inverse = np.eye(16)[None] / (4.0 * n)
+        monkeypatch.setattr(covariance, "evaluate_clusters", lambda *_, n=n, u=scores, h=h: [(slice(0, n), u, h)])
+        none = np.zeros((1, 16, 1))
+        system = Arrowhead(inverse, none, np.zeros((1, 1)), np.zeros((1, 16)), np.zeros(1), none)
+        state = DescentState(np.zeros((1, 16)), np.ones((1, 16), bool), np.zeros(1), np.zeros(1))
+        px, loose = SimpleNamespace(n_objects=1, first=np.array([0, n])), GaussianPrior(np.zeros((1, 16)), np.zeros((1, 16, 16)))
+        curve_prior = SimpleNamespace(scatter=np.zeros((1, 1)))
+        found, _ = covariance.sandwich_covariance(px, state, system, loose, curve_prior, None, FitOptions())
+        u = scores[:, :16]
+        expected = (1 + 0.5 / n) ** 2 * (u.T @ u) / (4.0 * n) ** 2 / min(1 - 1 / n, 1)
+        np.testing.assert_allclose(found[0], expected, rtol=1e-6)
 
 
 @pytest.mark.long

@@ -148,6 +148,16 @@ def test_patch_rows_are_medians_of_even_surface():
     assert rows.clipped[rows.patch == 39].all() and not rows.clipped[rows.value[:, 0] < 0.98].any()
 
 
+def test_saturation_begins_at_its_value():
+    """Of 40 pixels, 0, 11, 29 and 31 are as bright as `saturation`: a mean, none, none, a bound."""
+    for bright, known, bound in ((0, 0.49, False), (11, np.nan, False), (29, np.nan, False), (31, 0.5, True)):
+        value = np.where(np.arange(40)[:, None] < bright, 0.5, [0.49, 0.49, 0.2])
+        value[:, 2] = 0.2  # so that there is a row
+        rows = patch_rows(np.zeros(40, np.uint64), np.tile([0, 0, 1.0], (40, 1)), np.zeros(40, int), value, 0, saturation=0.5)
+        np.testing.assert_allclose(rows.value, [[known, known, 0.2]])
+        np.testing.assert_array_equal(rows.clipped, [[bound, bound, False]])
+
+
 def test_patch_rows_pass_through_a_curve():
     """The row of f(radiance) is f of the row of radiance."""
     patch, normal, block, value = _photograph(np.random.default_rng(1))

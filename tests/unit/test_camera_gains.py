@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -9,6 +12,7 @@ from iif_core.camera.calibration.choice import calibrate_response
 from iif_core.camera.gains import CameraGains, GainRows, choose_gains, estimate, falloff, radius_squared
 from iif_core.camera.overlap import PatchRows
 from iif_core.camera.response import response
+from iif_core.light.emission import response as calibrated_views
 from tests.errors import refused
 
 VIEWS = 10
@@ -141,3 +145,18 @@ def test_balanced_light_shows_what_the_gains_say():
     exposure = np.exp(np.log(factor).mean(1))
     shown = exposure[:, None, None] * balanced(lobes, factor / exposure[:, None])
     np.testing.assert_allclose(shown, factor[:, None] * lobes)
+
+
+def test_gains_of_views_that_are_not_used_are_those_of_the_start(monkeypatch):
+    """Of a curve that is given, the gains of used views are found on their surface; of others nothing is known but the start."""
+    start, found = CameraGains.plain(np.array([2.0, 3.0, 4.0])), CameraGains.plain(np.array([0.5, 1.0, 8.0]))
+    found = replace(found, estimated=np.array([True, False, True]))
+    monkeypatch.setattr(calibrated_views, "gain_rows", lambda rows, curve: SimpleNamespace(thinned=lambda: rows))
+    monkeypatch.setattr(calibrated_views, "choose_gains", lambda rows, views: found if views == 3 else None)
+    gains = calibrated_views._all_gains(start, np.array([0, 2]), SimpleNamespace(gains=None, response=None), None)
+    np.testing.assert_array_equal(gains.gain[:, 1], [0.5, 3.0, 8.0])
+    own = CameraGains(found.gain[[0, 2]], np.array([0.1, 0.2]), np.array([True, False]))
+    gains = calibrated_views._all_gains(start, np.array([0, 2]), SimpleNamespace(gains=own), None)
+    np.testing.assert_array_equal(gains.gain[:, 1], [0.5, 3.0, 8.0])
+    np.testing.assert_array_equal(gains.estimated, [True, False, False])
+    np.testing.assert_array_equal(gains.vignetting, [0.1, 0.2])

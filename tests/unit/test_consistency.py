@@ -1,10 +1,13 @@
 """Scores without truth: shading left, spread over views, the gain of a held-out photograph."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from iif_core.camera.response import response
 from iif_core.evaluation.consistency import ShadingLeft, ViewSpread, held_out_gain
+from workflow.scoring import no_reference
 
 
 def surface(n=4000, seed=0):
@@ -92,3 +95,50 @@ def test_extremes_of_the_gain():
     assert held_out_gain(some, some, np.zeros((2, 2), bool), curve).tolist() == [1.0] * 3
     assert np.isfinite(held_out_gain(some, np.zeros((2, 2, 3)), np.ones((2, 2), bool), curve)).all()
     assert np.isfinite(held_out_gain(some, np.ones((2, 2, 3)), np.ones((2, 2), bool), curve)).all()
+
+
+def test_scores_are_of_lit_inner_surface_that_neither_shines_nor_lets_light_through(monkeypatch):
+    """Two views of one wall, of which a result, its base and two predictions keep 0.2, 0.5, 0.8 and 1 of the light. Where a pixel
+    does not count, its albedo and light are wild."""
+    rng = np.random.default_rng(4)
+    shape, n = (20, 30), 600
+    face, objects = np.arange(n).reshape(shape) % 50, np.arange(n).reshape(shape) % 3
+    light, level = np.exp(rng.normal(0, 0.5, (2, *shape, 1))) * np.ones(3), np.array([0.2, 0.4, 0.6])[objects][..., None]
+    valid, interior = rng.random(shape) > 0.1, (rng.random(shape) > 0.1).astype(float)
+    emits, sheer = np.arange(50) % 7 == 3, np.arange(50) % 11 == 5
+    dark = rng.random(shape) < 0.05
+    face[0], objects[1] = -1, 2**32 - 1
+    off = ~valid | (interior < 0.5) | emits[face] | sheer[face] | (face < 0) | (objects > 2) | dark
+    wild = np.where(off, np.exp(rng.normal(0, 3, shape)), 1.0)[..., None] * np.ones(3)
+    keeps = {"affines": [0.2], "base": [0.5], "prior": [0.8, 1.0]}
+
+    def maps(stage, file):
+        if stage == "segmentation":
+            return {"object.id": objects.astype(np.uint32), "interior": interior}
+        number, out = int(file[5]), {}
+        for k, keep in enumerate(keeps[stage]):
+            albedo, layer = wild * level * light[number] ** keep, f"prior.{k:03d}.albedo" if stage == "prior" else "albedo"
+            out |= {f"{layer}.{c}": albedo[..., i] for i, c in enumerate("RGB")}
+        return out
+
+    def read(stage):
+        json = {"diffuse": {"cell_edge_m": 1.0}}
+        return SimpleNamespace(exr=lambda file: maps(stage, file), has=lambda file: stage in keeps, json=lambda file: json)
+
+    points = np.dstack([*np.indices(shape), np.zeros(shape)]) + 0.5  # every pixel is a cell of its own
+    capture = SimpleNamespace(
+        mesh=lambda: (np.array([[0.0, 0, 0], [20, 0, 0], [0, 30, 1]]), np.array([[0, 1, 2]])), gbuffer=lambda view: (None, face),
+        points=lambda view, depth: points, photo=lambda view: (None, valid),
+    )  # fmt: skip
+    lit = SimpleNamespace(is_sheer=sheer), SimpleNamespace(emits=emits)
+    seen = np.where(dark[..., None], 1e-3 * light, np.where(off[..., None], light / wild**2, light))
+    monkeypatch.setattr(no_reference, "read_lit_scene", lambda job: lit)
+    monkeypatch.setattr(
+        no_reference, "read_diffuse", lambda job, view: np.stack([0.5 * seen[int(view.name)], 1.5 * seen[int(view.name)]])
+    )
+    views = [SimpleNamespace(name="0"), SimpleNamespace(name="1")]
+    rows = {name: scores for name, _, _, scores in no_reference.truth_free_scores(SimpleNamespace(read=read), capture, views)}
+    apart = (np.log(light[0] / light[1])[~off][:, 0] ** 2 / 2).mean() ** 0.5
+    for name, keep in (("result", 0.2), ("base", 0.5), ("prior_k0", 0.8), ("prior_mean_k", 0.9)):
+        found = [score.value for score in rows[name]]
+        np.testing.assert_allclose(found, [1, keep, keep * apart], rtol=1e-5)

@@ -248,6 +248,16 @@ def test_a_curtain_is_one_lamp_however_its_folds_fall():
     assert (glowing_pieces(stats, adjacency, object_id, mirror) == -1).all()
 
 
+def test_a_piece_glows_if_its_brightest_channel_does():
+    """A blue shade, of whose light red and green are below what the wall shows, and a wall that is grey."""
+    _, faces = _strip(20)
+    object_id = np.repeat([0] * 6 + [1] * 14, 2)
+    mean = np.where(object_id[:, None] == 0, [0.1, 0.1, 2.0], 0.3)
+    pixels = np.arange(40), np.zeros(40, int), mean.max(1)
+    glowing = glowing_pieces(_statistics([30] * 40, mean.min(1), mean), face_adjacency(faces), object_id, pixels)
+    np.testing.assert_array_equal(glowing >= 0, object_id == 0)
+
+
 def test_a_lamp_that_is_cut_into_many_objects_stays_one():
     """Six quads of one lamp, each an object that glows by itself, next to a dark wall."""
     vertices, faces = _strip(20)

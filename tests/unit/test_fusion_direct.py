@@ -576,6 +576,8 @@ def test_no_views():
         ({"predictions": [np.zeros((2, 4, 4, 5))] * 8}, ("predictions", 16, SIZE * SIZE)),
         ({"n_cells": 10, "object_of_cell": np.zeros(10, int)}, ("cell id", 10)),
         ({"object_of_segment": np.zeros(2, int)}, ("segment id", 2)),
+        ({"scale": lambda view: np.ones((3, SIZE, SIZE))}, ("scales", f"(3, {SIZE}, {SIZE})", "(H, W, 3)")),
+        ({"scale": lambda view: np.ones((4, 4, 3))}, ("scales", "(4, 4, 3)", "(H, W, 3)")),
     ],
 )
 def test_inputs_that_do_not_fit_are_refused(change, names):

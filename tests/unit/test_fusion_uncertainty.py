@@ -101,6 +101,15 @@ def test_uncertainty_shrinks_with_views_and_predictions_and_grows_with_scale():
     assert (uncertainty.location_uncertainty(scale, views, views, 16) < one).all()
 
 
+def test_uncertainty_is_the_power_law():
+    """Eq. F.45: c b^g V^-h K^-q P^-p, with K predictions and P pixels a viewpoint; 0 viewpoints count as 1."""
+    law = Calibration(0.3, 0.8, 0.5, 0.4, -0.1, 1.0, 0.25)
+    b, views, pixels = np.array([0.02, 0.05, 0.07]), np.array([4, 9, 0]), np.array([64, 27, 16])
+    expected = 0.3 * b**0.8 / np.maximum(views, 1) ** 0.5 / 5**0.4 * np.array([16.0, 3.0, 16.0]) ** 0.1
+    np.testing.assert_allclose(law.deviation(b, views, pixels, 5), expected, rtol=1e-12)
+    assert law.beta(8) == pytest.approx(1.75)
+
+
 def test_margin_and_effective_number():
     error, usable = np.array([[1.0, 4.0, 2.0], [1, 1, 3], [5, 1, 1], [0, 0, 0]]), np.ones((4, 3), bool)
     np.testing.assert_allclose(margin(error, usable), [0.5, 0, 0, 0])

@@ -1,10 +1,12 @@
 """The search for the light of a room, on photographs in memory whose light is known."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from iif_core.light.emission import photographs
 from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.find import find_light, look_around
 from iif_core.light.emission.groups import EmitterGroups
@@ -109,6 +111,22 @@ def test_light_that_no_camera_ray_brings_has_no_brightness(closed):
     assert share == 0 and brightness is None
 
 
+def test_share_and_brightness_of_escaping_light():
+    """Two views: of 20 and 30 rays, 4 and 6 escape, of radiance 3; the valid pixels of surface show 0.5 and 1."""
+
+    def record(count, escaping, level):
+        pixels = SimpleNamespace(valid=np.arange(count - escaping) > 1, value=np.full((count - escaping, 3), level), index=None)
+        empty = {"escaping": None, "escaping_share": None, "escaping_direction": np.tile([0, 0, 1.0], (escaping, 1))}
+        return SimpleNamespace(pixels=pixels, counted=count, escaping_value=np.full((escaping, 3), 3.0), **empty)
+
+    log = SimpleNamespace(progress=lambda *_: None)
+    records = [record(20, 4, 0.5), record(30, 6, 1.0)]
+    photos = SimpleNamespace(views=[0, 1], records=records, log=log, radiance=lambda view, value, index: (value, value > 9))
+    sky, share, brightness = escaping_light(photos)
+    assert sky.pixels == 10 and share == 10 / 50
+    assert brightness == pytest.approx(3 * (14 + 22) / (14 * 0.5 + 22 * 1.0))
+
+
 def test_rows_are_of_pixels_that_show_one_thing(closed):
     """No border pixels of ordinary surface, none on the dark side of a lamp, none that may not be used."""
     photos, _ = closed
@@ -121,6 +139,23 @@ def test_rows_are_of_pixels_that_show_one_thing(closed):
     assert 0 < (thin.group < 0).sum() <= 3 * -(-photos.options.rows // 16) < (rows.group < 0).sum()
     again = choose_rows(blind, look.groups, look.threshold)[0]
     np.testing.assert_array_equal(again.number, pixels.number)
+
+
+def test_a_pixel_of_the_cache_is_a_bound_if_any_channel_is_saturated(monkeypatch):
+    monkeypatch.setattr(photographs, "cache_origin", lambda scene, edge: np.zeros(3))
+    value = np.array([[0.2, 0.2, 0.2], [0.2, 1.0, 0.2], [1.0, 1.0, 1.0], [0.2, 0.3, np.nan]])
+    pixels = SimpleNamespace(
+        value=value, index=None, points=np.arange(4)[:, None] + 0.5 * np.ones(3), face=np.arange(4),
+        valid=np.ones(4, bool), interior=np.ones(4, bool),
+    )  # fmt: skip
+    photos = SimpleNamespace(
+        options=SimpleNamespace(cache_edge=1.0), views=[0], records=[SimpleNamespace(pixels=pixels)], scene=None,
+        radiance=lambda view, value, index: (2 * value, value >= 1), log=SimpleNamespace(progress=lambda *_: None),
+    )  # fmt: skip
+    voxels, face = photographs.Photographs.cache_pixels.func(photos)
+    np.testing.assert_array_equal(face, [0, 1, 2])
+    np.testing.assert_array_equal(voxels.censored, [False, True, True])
+    np.testing.assert_array_equal(voxels.radiance, 2 * value[:3])
 
 
 def test_lamps_are_in_no_voxel_of_the_cache(closed):

@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,6 +9,7 @@ from iif_core.evaluation import flip
 from iif_core.evaluation import metrics as m
 from tests.errors import refused
 from tests.oracles import scores as single
+from workflow.scoring import of_views
 
 ALL = np.ones((24, 32), bool)
 
@@ -259,3 +262,40 @@ def test_mirror_threshold(roughness, counts):
     ones = np.ones((1, 1))
     masks = m.material_masks(ones > 0, ones > 0, np.zeros((1, 1, 3)), ones * roughness)
     assert bool(masks["albedo"][0, 0]) is counts
+
+
+def test_the_gain_over_raw_predictions_is_a_difference_of_decibels_and_a_ratio_of_errors():
+    def scores(psnr, l2):
+        return {"raw": {"psnr": {"mean": psnr}, "l2": {"mean": l2}}}
+
+    result = {"albedo": scores(23.5, 0.01), "roughness": scores(18.0, 0.0), "metallic": {"raw": {"lpips": {"mean": 0.1}}}}
+    prior = {"albedo": scores(20.25, 0.03), "roughness": scores(17.0, 0.02), "metallic": scores(9.0, 0.2)}
+    capture = SimpleNamespace(has_truth=True, views=[0, 1, 2])
+    rows = SimpleNamespace(means=lambda: {"result": result, "prior_mean_k": prior}, missing=[])
+    gains = of_views.summary(rows, capture, 2)["gain_over_raw_predictions"]
+    assert gains == {"albedo": {"raw": {"psnr_db": 3.25, "l2_ratio": 3.0}}, "roughness": {"raw": {"psnr_db": 1.0}}}
+    alone = SimpleNamespace(means=lambda: {"result": result}, missing=[])
+    assert of_views.summary(alone, capture, 2)["gain_over_raw_predictions"] == {}
+
+
+@pytest.mark.parametrize("is_hdr", [False, True])
+def test_radiance_is_scored_once_against_the_truth_or_a_linear_photograph(monkeypatch, is_hdr):
+    """A rendering that equals the linear photograph, and is twice the true radiance."""
+    radiance, mask = image(1), ALL.copy()
+    mask[:4] = False
+    layers = {"": radiance, "ldr.": image(2), "emission.": 0 * radiance}
+    channels = {f"{layer}{c}": picture[..., i] for layer, picture in layers.items() for i, c in enumerate("RGB")}
+    reader = SimpleNamespace(exr=lambda file: channels, has=lambda file: False)
+    capture = SimpleNamespace(
+        is_hdr=is_hdr, photo=lambda view, held_out: (radiance, mask), gbuffer=lambda view: (None, np.zeros(ALL.shape, int))
+    )
+    truth = SimpleNamespace(radiance=0.5 * radiance, emission=0 * radiance)
+    materials = SimpleNamespace(truth=truth, masks={"emission": mask})
+    monkeypatch.setattr(of_views, "read_base", lambda job: reader)
+    monkeypatch.setattr(of_views, "material_truth", lambda *arguments: materials)
+    job, view = SimpleNamespace(read=lambda stage: reader), SimpleNamespace(name="0", split="train")
+    rows = list(of_views.scores_of_view(job, capture, view, 1.0, object(), SimpleNamespace(albedo=None), {"rgb": {}}))
+    found = [values(scores) for _, _, quantity, scores in rows if quantity == "rgb" and scores[0].metric == "log_l2"]
+    expected = values(m.score_map("emission", radiance, radiance if is_hdr else truth.radiance, mask, metrics=("log_l2",)))
+    assert found == [pytest.approx({key: value for key, value in expected.items() if key[1] == "log_l2"})]
+    assert (found[0]["raw", "log_l2"] == pytest.approx(0)) == is_hdr

@@ -146,6 +146,16 @@ def test_any_levels_give_finite_gains(base, shown, scatter, smooth, pixels, base
     assert all(np.isfinite(x) for x in levels.facts().values())
 
 
+@pytest.mark.parametrize("fewest", [300, 301])
+def test_an_object_of_the_fewest_pixels_has_a_level_of_its_own(fewest):
+    """Six objects of 300 pixels, one of them in light that was computed half as bright as it is."""
+    problem, _ = problem_of(np.random.default_rng(5), 6, 300)
+    for cached in (problem.diffuse, problem.s0, problem.s1):
+        cached[0][problem.object_id == 0] *= 0.5
+    found = fit_affines(problem, response("identity"), FitOptions(min_pixels=fewest))
+    assert (found.light_gain[0] != 1) == (fewest == 300)
+
+
 def test_uneven_light_leaves_the_level_to_the_base_and_the_gloss_alone():
     """For one object in six, the light was computed half as bright as it is, and unevenly. The level of this object follows the
     base, not the light. The roughness of the other objects stays as in a fit in the right light."""

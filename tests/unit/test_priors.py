@@ -230,6 +230,28 @@ def test_retinex_uses_objects_and_gamma():
     assert ratio == pytest.approx((0.8 / 0.3) ** 2.2, rel=0.1)
 
 
+def test_the_light_of_retinex_is_as_the_photograph_was_exposed():
+    """What the photograph shows is albedo times light times exposure, so the albedo does not follow the exposure."""
+    light = SimpleNamespace(around=lambda own: (own.hit,), log_at=lambda hit: np.full((2, hit.sum(), 3), np.log(0.5)))
+    albedo = np.where(np.arange(WIDTH)[:, None] < 8, 0.6, 0.2) * np.ones((HEIGHT, WIDTH, 3))
+    hit = np.ones((HEIGHT, WIDTH), bool)
+    hit[:2] = False
+    prior = object.__new__(retinex.Retinex)
+    prior.settings, prior.seed, prior.light = SimpleNamespace(samples=2), 0, light
+    found = []
+    for exposure in (0.5, 1.0, 1.6):
+        own = SimpleNamespace(
+            value=exposure * 0.5 * albedo, depth=np.ones_like(albedo[..., 0]), hit=hit, valid=hit, saturated=np.zeros_like(hit),
+            object_id=(albedo[..., 0] < 0.4).astype(int), normals=np.tile([0.0, 0, 1], (HEIGHT, WIDTH, 1)),
+            camera=SimpleNamespace(exposure=exposure),
+        )  # fmt: skip
+        prior.views = SimpleNamespace(of=lambda _, own=own: own)
+        found.append(prior(view()).maps)
+    np.testing.assert_allclose(found[0][:, hit, :3], np.broadcast_to(albedo[hit], (2, hit.sum(), 3)), rtol=1e-3)
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-4)
+    np.testing.assert_allclose(found[2], found[1], rtol=1e-4)
+
+
 def test_pixels_without_a_value_take_their_neighbours():
     maps = np.tile(np.arange(6.0)[:, None, None], (1, 4, 5))
     maps[0, 0, 2] = np.nan

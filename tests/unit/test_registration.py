@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter1d
 
-from iif_core.camera.registration import Photo, feature_image, register
+from iif_core.camera.registration import Photo, feature_image, mesh_edges, register
 from tests.errors import refused
 from tests.unit.painted_room import FOCAL, look, off, posed, room, twisted
 
@@ -41,6 +41,16 @@ def test_features_do_not_depend_on_the_unit_of_radiance(photos: list[Photo]) -> 
     assert not feature_image(0 * image, usable).any() and not feature_image(image, usable & False).any()
 
 
+def test_edges_of_the_mesh_are_silhouettes_on_the_nearer_side_and_creases() -> None:
+    """Columns 0 to 3 are a near wall, 4 to 7 a far one, from 8 on it turns by 90 degrees at one depth."""
+    depth = np.where(np.arange(12) < 4, 1.0, 2.0) * np.ones((6, 1))
+    normal = np.where(np.arange(12)[:, None] < 8, [0.0, 0, -1], [1.0, 0, 0]) * np.ones((6, 1, 1))
+    at, near = mesh_edges(depth, normal, np.ones((6, 12), bool))
+    # Half way between two pixels; the crease is found from both sides, and rows at the border are left out.
+    expected = [(u, row + 0.5, z) for row in range(1, 5) for u, z in ((4.0, 1.0), (8.0, 2.0), (8.0, 2.0))]
+    assert sorted(map(tuple, np.c_[at, near])) == sorted(expected)
+
+
 def test_a_common_shift_of_the_principal_point_is_found(photos: list[Photo]) -> None:
     """The true principal point is (2, -1.5) pixels from the given one."""
     taken = [replace(p, image=np.repeat(look(p.pose, (66.0, 46.5))[0][..., None], 3, -1)) for p in photos]
@@ -48,6 +58,7 @@ def test_a_common_shift_of_the_principal_point_is_found(photos: list[Photo]) -> 
     assert found.accepted
     np.testing.assert_allclose(found.principal * FOCAL, [2.0, -1.5], atol=0.3)
     assert abs(found.focal - 1) < 0.01
+    np.testing.assert_allclose(found.moved, 2.5, atol=0.3)  # every pixel moves by the hypotenuse
 
 
 def test_what_is_right_is_left_alone(photos: list[Photo]) -> None:

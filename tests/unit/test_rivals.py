@@ -1,5 +1,7 @@
 """Rivals without a model of light: what the other photographs show of the surface of a held-out one."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from iif_core.camera.interpolation import Shown, by_others
 from iif_core.camera.view import View
 from iif_core.surface.triangles import face_geometry, towards_viewer
 from tests.unit import own_scene as own
+from workflow.scoring import rivals
 
 COLOUR = np.array([[0.3, 0.5, 0.2], [0.7, 0.4, 0.6]])  # of the room and of the block in it
 COUNT = 9
@@ -104,3 +107,20 @@ def test_what_stands_behind_or_faces_away_is_not_seen():
     points = np.array([[0, 0, 2.0], [0, 0, 2.2], [0, 0, -2.0], [0, 0, 2.0], [9, 0, 2.0]])
     normals = np.array([[0, 0, -1.0], [0, 0, -1.0], [0, 0, 1.0], [0, 0, 1.0], [0, 0, -1.0]])
     assert by_others(points, normals, np.zeros(3), [one])[2].tolist() == [True, False, False, False, False]
+
+
+def test_the_rivals_are_seen_from_the_eye_of_the_held_out_view(seen, monkeypatch):
+    """As `by_others` from there, whatever number of pixels is predicted at once."""
+    others = [shown(seen, np.full((*seen[i][1].shape, 3), float(i + 1)), i) for i in range(1, COUNT)]
+    at, *surface = targets(seen, 0)
+    monkeypatch.setattr(rivals, "BLOCK", 700)
+    rival = object.__new__(rivals.OtherPhotographs)
+    rival._normals = face_geometry(*own.room_mesh()[:2])[0]
+    rival._capture = SimpleNamespace(gbuffer=lambda view: seen[view.view_id][1:], used=range(COUNT - 1))
+    rival.shown, rival._developed = others.__getitem__, lambda view, radiance, photo, counted: radiance
+    photo = np.zeros((*seen[0][1].shape, 3))
+    found = dict(rival.predictions(seen[0][0], photo, photo[..., 0] == 0))
+    mean, blend, known = by_others(*surface, others)
+    assert known.sum() > 1400
+    for name, expected in (("photo_mean", mean), ("photo_nearest", blend)):
+        np.testing.assert_allclose(found[name].reshape(-1, 3)[at[known]], expected[known], rtol=1e-5)
