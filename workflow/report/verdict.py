@@ -404,7 +404,7 @@ def _gloss(e: Evidence) -> list[Finding | None]:
     return [
         _finding(
             "roughness_interval", e.roughness_interval,
-            f"Roughness is known to within ±{{}}; in {held.rooms()} rooms with truth, 95 % intervals of roughness held"
+            f"Roughness is known to within ±{{}}; in {held.rooms()} rendered rooms, 95 % intervals of roughness held"
             f" for {held.words('roughness')} of the objects that they are claimed of",
             remedy, ".2f", AMBER,
         )

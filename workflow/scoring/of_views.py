@@ -24,7 +24,7 @@ BASELINES = {
     "object_mean": "one value an object: mean of all predictions of all scored views",
     "texel_mean": "one value a surface cell: mean of all predictions of all scored views",
     "photo_mean": "a held-out photograph by the mean of the photographs that were used, without any model of light",
-    "photo_nearest": "the same by a blend of the photographs from nearest by",
+    "photo_nearest": "the same by a blend of the nearest photographs",
     "photo_as_albedo": "the mean radiance of each surface cell, at the level of the base, taken for its albedo",
     "base": "the fused base texture, before the fit to the photographs",
     "result": "what is published",
