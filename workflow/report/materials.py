@@ -36,7 +36,8 @@ def intervals_note() -> str:
     shares, metals = [f"{name} of {held.words(name)}" for name in ("albedo", "roughness", "metallic")], held.measured()["metals"]
     return (
         "In brackets the 95 % interval, for albedo of its brightest channel; roughness that no photograph shows has 0 to 1."
-        f" In {held.rooms()} rendered rooms with exact cameras and mesh such intervals held the {', '.join(shares[:2])} and {shares[2]}"
+        f" In {held.rooms()} rendered rooms with exact cameras and mesh such intervals held the {', '.join(shares[:2])}"
+        f" and {shares[2]}"
         " of the objects that they are claimed of. Few objects are metal, and metal is easily missed: of"
         f" {metals['true']} metals the interval held {metals['held']}."
     )
