@@ -270,7 +270,7 @@ def choose_rows(
     whole = (group >= 0) & ~shown.partial & ~shown.bound.any(1)
     enough = np.bincount(group[whole & use], minlength=groups.size) >= photos.options.min_observations
     use &= ~(shown.partial & np.append(enough, False)[group])
-    return every.take(use), replace(shown.take(use).with_majority(groups.size), rest=rest)
+    return every.take(use), replace(shown.take(use).with_majority(), rest=rest)
 
 
 def _coverage(

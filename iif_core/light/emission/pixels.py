@@ -52,16 +52,18 @@ class EmissionPixels(Rows):
             out[own, : self.coverage.shape[1]] = self.coverage[own]
         return out
 
-    def with_majority(self, groups: int) -> EmissionPixels:
-        """Return the pixels, all that look at a group being lower bounds in the channels in which more than half of them are.
+    def with_majority(self) -> EmissionPixels:
+        """Return the pixels; where most of those of a group in a view are lower bounds in a channel, the others are too.
 
         Compression, blur, noise and wrong poses lower some of the pixels of a saturated lamp to below saturation. They would be
-        taken for its radiance, against everything that the other pixels say; what they show is still less than it.
+        taken for its radiance, against everything that the other pixels say; what they show is still less than it. A view with a
+        shorter exposure, in which most pixels of the lamp are not saturated, tells its radiance.
         """
         own, bound = self.group >= 0, self.bound.copy()
-        count = np.bincount(self.group[own], minlength=groups)[:, None]
-        bounded = np.stack([np.bincount(self.group[own], bound[own, c], groups) for c in range(3)], 1)
-        bound[own] |= (2 * bounded > count)[self.group[own]]
+        _, lamp = np.unique(np.stack([self.group[own], self.view[own]]), axis=1, return_inverse=True)
+        lamp = lamp.reshape(-1)
+        for channel in bound.T:
+            channel[own] |= (2 * np.bincount(lamp, channel[own]) > np.bincount(lamp))[lamp]
         return replace(self, bound=bound)
 
     @property
