@@ -31,13 +31,28 @@ def test_the_few_pixels_of_a_saturated_lamp_are_lower_bounds_too():
     np.testing.assert_array_equal(got.radiance, np.where(bound, BRIGHT, DIM))  # each is bounded by what it shows itself
 
 
-def test_a_view_that_is_exposed_for_the_lamp_tells_its_radiance():
-    """Most photographs of a lamp are saturated; the one that is not shows how bright it is."""
-    bound = np.ones((22, 3), bool)
-    bound[18:] = False
-    bound[20] = True  # a pixel of the short exposure
-    got = pixels(np.zeros(22, int), np.repeat([3, 4, 7], (9, 9, 4)), bound).with_majority()
-    np.testing.assert_array_equal(got.bound, bound)
+def test_a_shorter_exposure_tells_the_radiance_of_a_lamp():
+    """Most photographs of a lamp are saturated. One that is not shows how bright it is, or less than that: only its rim."""
+    short, rim, mixed = slice(18, 22), slice(22, 26), slice(26, 30)
+    bound = np.ones((30, 3), bool)
+    bound[short] = bound[rim] = False
+    bound[27:30] = False  # one pixel of this view is saturated
+    lamp = pixels(np.zeros(30, int), np.repeat([3, 4, 7, 8, 9], (9, 9, 4, 4, 4)), bound)
+    lamp.radiance[short] = lamp.radiance[mixed] = 2 * BRIGHT
+    lamp.radiance[18] = DIM  # a dark pixel does not spoil the view
+    got = lamp.with_majority()
+    assert not got.bound[short].any()
+    assert got.bound[rim].all() and got.bound[mixed].all()
+    np.testing.assert_array_equal(got.bound[:18], bound[:18])
+
+
+def test_a_few_bounds_that_are_too_high_hide_no_shorter_exposure():
+    bound = np.ones((40, 3), bool)
+    bound[36:] = False
+    lamp = pixels(np.zeros(40, int), np.repeat(np.arange(10), 4), bound)
+    lamp.radiance[:2] = 9 * BRIGHT  # noise
+    lamp.radiance[36:] = 1.5 * BRIGHT
+    np.testing.assert_array_equal(lamp.with_majority().bound, bound)
 
 
 def test_pixels_that_look_at_no_lamp_stay_as_they_are():

@@ -16,6 +16,8 @@ FULL_COVERAGE = 0.95
 """Share of a pixel from which an emitter counts as filling it."""
 COVERAGE_ERROR = 0.05
 """By which shares of pixels may be wrong: few rays, and edges of a mesh that are not quite where the photograph has them."""
+HIGH_BOUND = 0.9
+"""Quantile of the lower bounds of a lamp that its radiance exceeds for certain; the highest few may be noise."""
 ANCHOR_PIXELS = 64
 """At least this many directly seen pixels of each group enter the solve."""
 
@@ -53,17 +55,24 @@ class EmissionPixels(Rows):
         return out
 
     def with_majority(self) -> EmissionPixels:
-        """Return the pixels; where most of those of a group in a view are lower bounds in a channel, the others are too.
+        """Return the pixels; where most of those of a group are lower bounds in a channel, the others are too.
 
         Compression, blur, noise and wrong poses lower some of the pixels of a saturated lamp to below saturation. They would be
-        taken for its radiance, against everything that the other pixels say; what they show is still less than it. A view with a
-        shorter exposure, in which most pixels of the lamp are not saturated, tells its radiance.
+        taken for its radiance, against everything that the other pixels say; what they show is still less than it. A shorter
+        exposure shows the radiance itself, which no bound exceeds: views that have no bound in the channel, and a median of at
+        least the `HIGH_BOUND` quantile of the bounds, stay as they are.
         """
-        own, bound = self.group >= 0, self.bound.copy()
-        _, lamp = np.unique(np.stack([self.group[own], self.view[own]]), axis=1, return_inverse=True)
-        lamp = lamp.reshape(-1)
-        for channel in bound.T:
-            channel[own] |= (2 * np.bincount(lamp, channel[own]) > np.bincount(lamp))[lamp]
+        bound = self.bound.copy()
+        for group in np.unique(self.group[self.group >= 0]):
+            own = np.flatnonzero(self.group == group)
+            for c in range(3):
+                known, shown = self.bound[own, c], self.radiance[own, c]
+                if 2 * known.sum() <= len(own):
+                    continue
+                least = np.quantile(shown[known], HIGH_BOUND)
+                for view in np.unique(self.view[own]):
+                    here = self.view[own] == view
+                    bound[own[here], c] |= known[here].any() or np.median(shown[here]) < least
         return replace(self, bound=bound)
 
     @property
