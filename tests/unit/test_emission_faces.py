@@ -47,13 +47,13 @@ def test_face_statistics_by_hand():
     value[40:43] = [[0.5, 0, 0], [0.2, 0.7, 0], [0, 0, np.nan]]
     out = face_statistics(face, value, np.arange(44) % 2 == 0, 4)
     assert out.count.tolist() == [40, 0, 2, 0]
-    np.testing.assert_allclose(out.low, [0.02, 0, 0.5, 0], atol=1e-7)  # rank floor(0.05 * 40) = 2
+    np.testing.assert_allclose(out.low, [0.1, 0, 0.5, 0], atol=1e-7)  # rank floor(0.25 * 40) = 10
     np.testing.assert_allclose(out.mean[2], [0.35, 0.35, 0], atol=1e-7)
     np.testing.assert_allclose(out.front, [0.5, 0, 0.5, 0])
 
 
 def test_quantile_forgives_a_few_dark_pixels_but_not_many():
-    for dark, expected in ((1, True), (4, False)):
+    for dark, expected in ((9, True), (11, False)):
         value = np.ones((40, 3))
         value[:dark] = 0.3
         stats = face_statistics(np.zeros(40, int), value, np.ones(40, bool), 1)

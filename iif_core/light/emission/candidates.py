@@ -11,6 +11,9 @@ import numpy as np
 
 from iif_core.numerics.graph import component_labels
 
+LOW_QUANTILE = 0.25
+"""Share of the pixels of a face that may be dark although it shines: blur, compression and wrong poses put the surroundings of a
+small lamp into some of its pixels."""
 SMALL_AREA = 0.25
 """Surface (m^2) of a lamp that may be one group whatever its shape."""
 _BRIDGE = 3  # faces by which pools reach over unseen surface
@@ -44,7 +47,7 @@ def face_statistics(
     from_front: np.ndarray,
     n_faces: int,
     bound: np.ndarray | None = None,
-    quantile: float = 0.05,
+    quantile: float = LOW_QUANTILE,
 ) -> FaceStatistics:
     """Summarise the pixels that see each face.
 
