@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from iif_core.numerics.arrays import unique_rows
-from iif_core.surface.holes import close_holes
 from iif_core.surface.simplify import clean, simplify
 from iif_core.surface.triangles import face_geometry
-from workflow.settings.source import CLOSED_HOLES
 
 Array = np.ndarray
 
@@ -94,17 +92,6 @@ def scanned(vertices: Array, faces: Array, ids: Array, emission: Array, rng: np.
         local.reshape(-1, 3).astype(np.int32),
         kind[:, :count].astype(np.int32),
         kind[:, count:].astype(np.float32),
-    )
-
-
-def closed(scan: Scanned) -> Scanned:
-    """Close the holes of a scan that the product closes in a mesh file; the new faces come last and do not shine."""
-    new = close_holes(scan.vertices, scan.faces, CLOSED_HOLES)
-    return Scanned(
-        scan.vertices,
-        np.concatenate([scan.faces, new.faces]),
-        np.concatenate([scan.ids, scan.ids[new.beside]]),
-        np.concatenate([scan.emission, np.zeros((len(new.faces), 3), np.float32)]),
     )
 
 

@@ -272,10 +272,10 @@ class _Capture:
     def _scanned(self, instance: Array) -> Scanned:
         """Return the mesh as a scan of it would be."""
         from lab.simulated.realism import stream
-        from lab.simulated.scanned import closed, scanned
+        from lab.simulated.scanned import scanned
 
         rng = stream(self.job.seed, "mesh")
-        return closed(scanned(self.mesh.vertices, self.mesh.faces, instance[:, None], self.mesh.emission, rng))
+        return scanned(self.mesh.vertices, self.mesh.faces, instance[:, None], self.mesh.emission, rng)
 
     def _normals(self, view: View, face: Array) -> Array:
         """Return world normals towards the camera (H, W, 3), 0 where nothing is hit."""

@@ -16,10 +16,6 @@ MESH_UP = {"as_poses": AS_IS, "y": "x -z y", "z": "x z -y"}
 """Words of `source.mesh_up` -> the axes of the poses, as axes of the mesh file."""
 
 
-CLOSED_HOLES = 0.4
-"""Metres: the default of `source.close_holes`."""
-
-
 def mesh_axes(mesh_up: str) -> str:
     """Return the axes of the poses, as axes of the mesh file, of a value of `source.mesh_up`."""
     return MESH_UP.get(mesh_up, mesh_up)
@@ -35,10 +31,6 @@ class PhotographedSource(Section):
     mesh_up: Literal["as_poses", "y", "z"] | str = "as_poses"
     """How the mesh file is turned against the poses: `y`: it has y up and they have z up (as a GLB of a room with z up), `z`: the
     other way round. Any other quarter turn: the x, y and z of the poses, as axes of the mesh file, such as `z x y`."""
-
-    close_holes: float = Field(CLOSED_HOLES, ge=0, le=5)
-    """Close holes of the mesh that are at most so many metres across and flush with the surface around them, as scans have them;
-    0 = none. What lets light into a room is rarely narrower than the default."""
 
     @field_validator("mesh_up")
     @classmethod

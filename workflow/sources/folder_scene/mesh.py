@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.surface.axes import AS_IS, turn_of
-from iif_core.surface.holes import close_holes
 from iif_core.surface.triangles import face_geometry
 from workflow.intake import limits
 from workflow.intake.documents import check_file, reading
@@ -162,20 +161,6 @@ def load(path: Path, metres: float, of_vertices: VertexIds | None = None, axes: 
         known = of_vertices.names if of_vertices is not None else {}
         mesh.names = [known.get(int(i), f"instance {i}") for i in given]
     return mesh
-
-
-def closed(mesh: Mesh, widest: float) -> Mesh:
-    """Return the mesh without the holes that are at most `widest` metres across and flush with the surface around them.
-
-    The new faces come last, and belong to an object at their rim.
-    """
-    new = close_holes(mesh.vertices, mesh.faces, widest)
-    if not len(new.width):
-        return mesh
-    said = f"mesh: {len(new.width)} holes closed, of up to {new.width.max():.2f} m and {new.area:.2g} m^2 in all"
-    faces = np.concatenate([mesh.faces, new.faces])
-    instance = None if mesh.instance is None else np.concatenate([mesh.instance, mesh.instance[new.beside]])
-    return replace(mesh, faces=faces, instance=instance, notes=[*mesh.notes, said])
 
 
 def majority_id(ids: np.ndarray) -> np.ndarray:
