@@ -31,9 +31,12 @@ class Realism(Section):
     """The mesh bulges, has holes and is decimated."""
     unguided: bool = True
     """Three times as many paths, and a denoiser that sees nothing but the picture, whatever `capture.denoise` says."""
+    reduced: int = Field(1, ge=1, le=16)
+    """Photographs are so many times as wide when they are taken, and are then reduced. Noise, blur, JPEG and poses are those of the
+    large ones."""
 
 
-IDEAL = Realism(**dict.fromkeys(Realism.model_fields, False))
+IDEAL = Realism(**{name: False for name, field in Realism.model_fields.items() if field.annotation is bool})
 
 
 def _of_word(value: Any) -> Any:
@@ -44,7 +47,7 @@ def _of_word(value: Any) -> Any:
     if value is None or isinstance(value, dict | Realism):
         return value
     effects = ", ".join(Realism.model_fields)
-    raise ValueError(f"Needed: 'ideal', 'as_captured', or a mapping that switches some effects off: {effects}")
+    raise ValueError(f"Needed: 'ideal', 'as_captured', or a mapping that changes some effects: {effects}")
 
 
 class Capture(source.Capture):

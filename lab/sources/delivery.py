@@ -183,7 +183,7 @@ def _photographs(job: Job, rendered: Rendered, out: Delivered) -> Array:
 def taken(
     radiance: Array, exposure: float, gains: Array, wanted: Any, curve: ResponseCurve | None, rng: np.random.Generator
 ) -> Array:
-    """Photograph one picture: blur, exposure, noise, saturation, white balance, response, eight bits, JPEG.
+    """Photograph one picture: blur, exposure, noise, saturation, white balance, response, eight bits, JPEG; then reduce it.
 
     Args:
         radiance: (H, W, 3) float64.
@@ -195,23 +195,34 @@ def taken(
     from lab.simulated import realism
     from lab.simulated.photographs import expose
 
+    times = wanted.reduced
+    if times > 1:
+        radiance = radiance.repeat(times, 0).repeat(times, 1)
     image = realism.lens_blur(radiance) if wanted.blur else radiance
     if curve is None and not (wanted.noise or wanted.exposure):
-        return image
+        return _means(image, times)
     signal = exposure * image
     if wanted.noise:
         signal = np.maximum(realism.sensor_noise(signal, rng), 0)
     if curve is None:
-        return gains * signal / (1 if wanted.exposure else exposure)
+        return _means(gains * signal / (1 if wanted.exposure else exposure), times)
     photo = expose(gains * np.minimum(signal, 1), 1.0, curve)
-    return realism.jpeg(photo) if wanted.jpeg else photo
+    return _means(realism.jpeg(photo) if wanted.jpeg else photo, times)
+
+
+def _means(image: Array, edge: int) -> Array:
+    """Means of squares of `edge` pixels."""
+    if edge == 1:
+        return image
+    height, width = image.shape[0] // edge, image.shape[1] // edge
+    return image.reshape(height, edge, width, edge, 3).mean((1, 3))
 
 
 def _registered(job: Job, writer: RenderedWriter, rendered: Rendered, room: Room, out: Delivered) -> list[int]:
     """Replace the cameras by wrong ones, registered as a folder's are; return the rows of `rendered` that are left."""
     from iif_core.camera.distortion import Distortion
     from iif_core.camera.registration import Photo
-    from lab.simulated.realism import focal_factor, misplaced, stream
+    from lab.simulated.realism import POSE_ERROR, focal_factor, misplaced, stream
     from workflow.sources.folder import MIN_COVERAGE
     from workflow.sources.folder_scene import images, registration
     from workflow.sources.folder_scene.photographs import pinhole, view_of
@@ -220,7 +231,8 @@ def _registered(job: Job, writer: RenderedWriter, rendered: Rendered, room: Room
     factor, frames, photos = focal_factor(stream(job.seed, "focal")), [], []
     for number, view in enumerate(out.views):
         depth = writer.writer.channels(f"gbuffer/{view.name}.exr")["depth.Z"]
-        view = misplaced(view, view.points(depth, np.float64)[depth > 0], stream(job.seed, "pose", view.view_id))
+        seen, pixels = view.points(depth, np.float64)[depth > 0], POSE_ERROR / effects(job.settings.capture).reduced
+        view = misplaced(view, seen, stream(job.seed, "pose", view.view_id), pixels)
         camera = pinhole(replace(view, fx=factor * view.fx, fy=factor * view.fy))
         frame = Frame(view.name, view.name, Path(view.name), 1, camera, Distortion("radial_tangential"), view.world_from_camera)
         small = view_of(frame, view.world_from_camera, number, (registration.WIDTH, registration.WIDTH))

@@ -25,7 +25,7 @@ from workflow.scene.normal_form import CaptureReader
 from workflow.settings.scene import SceneSettings, recorded
 
 Z = 4.5  # standard errors; a correct function fails once in 150,000 runs, and the seeds are fixed
-EFFECTS = tuple(Realism.model_fields)
+EFFECTS = tuple(name for name in Realism.model_fields if name != "reduced")
 OF_PHOTOGRAPHS = ("noise", "blur", "jpeg")
 
 
@@ -95,7 +95,7 @@ def test_jpeg_loses_detail_and_keeps_flat_surface():
 
 
 def _only(*names):
-    return SimpleNamespace(**{name: name in names for name in EFFECTS})
+    return SimpleNamespace(**{name: name in names for name in EFFECTS}, reduced=1)
 
 
 def test_each_effect_of_photographs_is_switched_alone():
@@ -112,6 +112,22 @@ def test_each_effect_of_photographs_is_switched_alone():
     assert (tinted[(1.5 * radiance >= 1).all(-1)] == 1).all()  # what saturates, stays so
     every = taken(radiance, 1.5, gains, _only(*EFFECTS), curve, rng())
     np.testing.assert_array_equal(np.rint(255 * every), np.rint(255 * every.astype(np.float64)))
+
+
+def test_a_reduced_photograph_has_less_noise_blur_and_jpeg():
+    """The mean of n^2 pixels has 1/n of their noise; nothing that is constant changes."""
+    curve, flat = response_curve(), np.full((16, 24, 3), 0.2)
+    settings = {times: SimpleNamespace(**{name: name == "noise" for name in EFFECTS}, reduced=times) for times in (1, 4)}
+    spread = {times: taken(flat, 1.0, np.ones(3), wanted, None, rng(6)).std() for times, wanted in settings.items()}
+    assert spread[4] == pytest.approx(spread[1] / 4, rel=0.1)
+    image = rng(7).gamma(2.0, 0.1, (24, 32, 3))
+    wrong = {}
+    for times in (1, 4):
+        wanted = SimpleNamespace(**{name: name in ("blur", "jpeg") for name in EFFECTS}, reduced=times)
+        photo = taken(image, 1.0, np.ones(3), wanted, curve, rng())
+        assert photo.shape == image.shape
+        wrong[times] = np.abs(photo - expose(image, 1.0, curve)).mean()
+    assert wrong[4] < 0.5 * wrong[1]
 
 
 def test_linear_photographs_have_a_scale_only_if_exposures_are_known():
