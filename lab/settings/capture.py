@@ -32,8 +32,8 @@ class Realism(Section):
     unguided: bool = True
     """Three times as many paths, and a denoiser that sees nothing but the picture, whatever `capture.denoise` says."""
     reduced: int = Field(1, ge=1, le=16)
-    """Photographs are so many times as wide when they are taken, and are then reduced. Noise, blur, JPEG and poses are those of the
-    large ones."""
+    """Photographs are so many times as wide when they are taken, and are then reduced. Noise, blur, JPEG and poses are those
+    of the large ones."""
 
 
 IDEAL = Realism(**{name: False for name, field in Realism.model_fields.items() if field.annotation is bool})
