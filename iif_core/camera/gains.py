@@ -25,6 +25,7 @@ MIN_ROWS = 8
 MAX_ROWS = 40_000
 """Number of rows from which the gains of all views are estimated."""
 _VIGNETTING_SIGMA = 1.0  # standard deviation of the prior of a and b
+_CHROMA_SIGMA = 0.5  # of the log gain of a channel relative to its view, many times what cameras do
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,11 @@ def estimate(rows: GainRows, n_views: int, white_balance: bool = True, vignettin
     gauge, group = data.gauge(n_views, white_balance, vignetting)
     theta, weight, scale = np.zeros(design.shape[1]), np.ones(len(data.value)), 0.0
     # Views without rows have empty columns and stay at gain 1.
-    known = np.flatnonzero(np.asarray(np.abs(design).sum(0)).ravel() > 0)
+    known = np.asarray(np.abs(design).sum(0)).ravel() > 0
+    if white_balance:
+        of_channels = known[: 3 * n_views].reshape(n_views, 3)
+        of_channels |= of_channels.any(1, keepdims=True)
+    known = np.flatnonzero(known)
     for _ in range(rounds):
         # -------- levels of the patches eliminated: X'Q'WQX and X'Q'WQ ln y (Eq. C.26) --------
         # `mixed` sums weighted rows of X over each patch; the product below is what the mean of each patch takes away.
@@ -159,6 +164,10 @@ def estimate(rows: GainRows, n_views: int, white_balance: bool = True, vignettin
         # -------- gauge and prior --------
         # The data leave the mean of each group of views open. A projector on these means sets them to 0 and changes no ratio.
         normal += gauge * max(float(np.trace(normal)) / len(theta), 1e-12)
+        # A channel that is saturated where two groups of views overlap does not tie them to each other: their chroma does.
+        if white_balance:
+            chroma = np.kron(np.eye(n_views), np.eye(3) - 1 / 3)
+            normal[: 3 * n_views, : 3 * n_views] += chroma * max(scale, 1e-3) ** 2 / _CHROMA_SIGMA**2
         if vignetting:
             normal[[-2, -1], [-2, -1]] += max(scale, 1e-3) ** 2 / _VIGNETTING_SIGMA**2  # rows count 1, not 1 / scale^2
         step = np.zeros(len(theta))

@@ -52,6 +52,20 @@ def test_gains_within_one_per_cent_and_vignetting():
     np.testing.assert_allclose(np.log(out.gain).mean(0), 0.0, atol=1e-6)
 
 
+@pytest.mark.parametrize("lost", ["between two groups", "in one view"])
+def test_a_channel_that_ties_no_views_follows_the_others(lost):
+    """Blue is saturated on all surface that two groups of views share, or in one view; red and green tell the exposures."""
+    rows, gain = planted(balance=0.0, vignetting=np.zeros(2), noise=0.01, gloss=0.0)
+    first, y = rows.view < VIEWS // 2, rows.y.copy()
+    if lost == "in one view":
+        y[rows.view == 3, 2] = np.nan
+    else:
+        y[np.where(rows.patch % 2 == 0, first, ~first), 2] = np.nan  # no patch is blue in both
+    out = estimate(replace(rows, y=y), VIEWS, vignetting=False)
+    assert out.estimated.all()
+    np.testing.assert_allclose(out.gain, gain, rtol=0.01)
+
+
 def test_exact_data_are_solved_exactly():
     rows, gain = planted(noise=0.0, gloss=0.0)
     out = estimate(rows, VIEWS)
