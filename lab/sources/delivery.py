@@ -195,7 +195,7 @@ def taken(
     from lab.simulated import realism
     from lab.simulated.photographs import expose
 
-    times = wanted.reduced
+    times = wanted.reduced if wanted.blur or wanted.noise or wanted.jpeg else 1  # nothing else depends on the size
     if times > 1:
         radiance = radiance.repeat(times, 0).repeat(times, 1)
     image = realism.lens_blur(radiance) if wanted.blur else radiance
