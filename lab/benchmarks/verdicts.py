@@ -19,6 +19,7 @@ import argparse
 import csv
 import dataclasses
 import importlib
+import itertools
 import json
 import shutil
 import sys
@@ -611,13 +612,13 @@ def case_row(room: str, spoil: str, folder: Path) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------------------------- tables
 
 TUNED: dict[str, tuple[float, ...]] = {
-    "misfit": (0.03, 0.04, 0.05, 0.06, 0.08, 0.1),
-    "doubtful_area": (0.25, 0.5, 1.0),
-    "uncertainty": (0.1, 0.11, 0.12, 0.13, 0.15),
-    "photographed": (0.6, 0.5, 0.4, 0.3),
-    "agreement": (0.8, 0.7, 0.6, 0.5),
-    "rerendering": (22.0, 20.0, 18.0, 16.5),
-    "light_scale": (1.2, 1.3, 1.4, 1.5),
+    "misfit": (0.04, 0.05, 0.06, 0.08, 0.1),
+    "doubtful_area": (0.25, 0.5),
+    "uncertainty": (0.1, 0.11, 0.12, 0.15),
+    "photographed": (0.6, 0.5, 0.4),
+    "agreement": (0.8, 0.7, 0.6),
+    "rerendering": (22.0, 20.0, 18.0),
+    "light_scale": (1.2, 1.3, 1.4),
 }
 """Evidence whose last green value the rows choose -> values that are tried, strictest first. The other thresholds have reasons of
 their own."""
@@ -664,35 +665,35 @@ def limits(greens: Mapping[str, float]) -> Iterator[None]:
         LIMITS.update(before)
 
 
-def chosen(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+def greens_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Array]:
+    """Return of each evidence of `TUNED` which lights are green, (values, lights, rows) bool, at each of its values while the
+    others have their loosest. A light is green where no finding is worse, so it is green at any values where it is at each."""
+    loosest, out = {name: values[-1] for name, values in TUNED.items()}, {}
+    for name, values in TUNED.items():
+        found = []
+        for value in values:
+            with limits({**loosest, name: value}):
+                colours = [judged(row["evidence"]) for row in rows]
+            found.append([[of_row[light] == GREEN for of_row in colours] for light in LIGHTS])
+        out[name] = np.array(found)
+    return out
+
+
+def chosen(rows: Sequence[Mapping[str, Any]], greens: Mapping[str, Array]) -> dict[str, float]:
     """Choose the last green values of `TUNED`: of those under which each light is right in `HOLDS` of its greens, and no green is
-    next to a severe fault, those under which most right lights are green; of equals the strictest. One value after another is
-    chosen, from the strictest on, until none changes."""
-
-    def cost(greens: Mapping[str, float]) -> float:
-        with limits(greens):
-            return _cost(rows)
-
-    now = {name: values[0] for name, values in TUNED.items()}
-    for _ in range(4):
-        before = dict(now)
-        for name, values in TUNED.items():
-            now[name] = min(values, key=lambda value: cost({**now, name: value}))  # noqa: B023  of equals the first
-        if now == before:
-            break
-    return now
-
-
-def _cost(rows: Sequence[Mapping[str, Any]]) -> float:
-    lights = [judged(row["evidence"]) for row in rows]
-    cost = 0.0
-    for light in LIGHTS:
-        green = [row for row, found in zip(rows, lights, strict=True) if found[light] == GREEN]
-        wrong = sum(not row["right"][light] for row in green)
-        allowed = (1 - HOLDS) * len(green)
-        lost = sum(row["right"][light] and found[light] != GREEN for row, found in zip(rows, lights, strict=True))
-        cost += lost + 1e3 * max(0, wrong - allowed) + 1e3 * sum(row["severe"] for row in green)
-    return cost
+    next to a severe fault, those under which most right lights of captures that nobody spoilt are green; of equals the strictest.
+    `greens`: of these rows."""
+    good = np.array([row["spoil"] in GOOD for row in rows])
+    right = np.array([[row["right"][light] for row in rows] for light in LIGHTS])
+    severe = np.array([row["severe"] for row in rows])
+    best, values = (np.inf, 0), ()
+    for at in itertools.product(*(range(len(tried)) for tried in TUNED.values())):
+        green = np.logical_and.reduce([greens[name][i] for name, i in zip(TUNED, at, strict=True)])
+        wrong = np.maximum((green & ~right).sum(1) - (1 - HOLDS) * green.sum(1), 0).sum()
+        cost = (right & good & ~green).sum() + 1e3 * (wrong + (green & severe).sum())
+        if (cost, sum(at)) < best:
+            best, values = (cost, sum(at)), at
+    return {name: tried[i] for (name, tried), i in zip(TUNED.items(), values, strict=True)}
 
 
 def counted(rows: Sequence[Mapping[str, Any]], colours: Sequence[Mapping[str, str]]) -> dict[str, Any]:
@@ -709,8 +710,10 @@ def counted(rows: Sequence[Mapping[str, Any]], colours: Sequence[Mapping[str, st
 def left_out(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """Return the colours of every row by thresholds that the other rooms have made."""
     found: dict[str, dict[str, float]] = {}
+    greens = greens_of(rows)
     for room in sorted({row["room"] for row in rows}):
-        found[room] = chosen([row for row in rows if row["room"] != room])
+        others = [i for i, row in enumerate(rows) if row["room"] != room]
+        found[room] = chosen([rows[i] for i in others], {name: green[..., others] for name, green in greens.items()})
         print(f"without {room}: {found[room]}", file=sys.stderr, flush=True)
     out = []
     for row in rows:
@@ -747,7 +750,7 @@ def summarise(file: Path) -> None:
         "lights": {light: {**found[light], "left_out": without[light][GREEN]} for light in LIGHTS},
     }
     calibration.FILE.write_text(json.dumps(document, indent=1) + "\n")
-    print(f"chosen from all rooms: {chosen(rows)}", file=sys.stderr)
+    print(f"chosen from all rooms: {chosen(rows, greens_of(rows))}", file=sys.stderr)
     page = PAGE.read_text()
     tables = {
         "lights": _lights_table(rows, colours, apart),
