@@ -31,14 +31,19 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 
 def capture(job: Job) -> None:
     """Build the room, photograph it, and write the normal form with ground truth."""
+    from lab import rooms
+
+    photograph_room(job, rooms.build(job.settings.source.scene, job.settings.source.quarterings))
+
+
+def photograph_room(job: Job, room: Room) -> None:
+    """Photograph a room, and write the normal form with ground truth."""
     from workflow.runtime import device, native
 
     native.prepare()
     device.mitsuba()
     native.limit_threads(job.threads)
-    from lab import rooms
-
-    _Capture(job, rooms.build(job.settings.source.scene, job.settings.source.quarterings)).run()
+    _Capture(job, room).run()
 
 
 class _Capture:

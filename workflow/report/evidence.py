@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from iif_core.light.emission.options import EmissionOptions
 from workflow.decisions import numerics
 from workflow.report.reported import Reported
 from workflow.report.scores import found
@@ -13,6 +14,11 @@ from workflow.report.verdict import Evidence
 
 NUMERICS = ("base", "emission", "shading", "affines")
 """Stages that say where their arithmetic came close to its end."""
+BRIGHT = 12.0
+"""A surface that is at most so many times as bright as nine tenths of the room may reflect its light: a white ceiling around a
+lamp was 3 to 11 times as bright, window panes and lamp shades 11 to 80 times (lab/notebook/verdicts.md)."""
+SHOWN = 0.2
+"""A lamp that fewer pixels show than this share of what surface of its area has on average is hardly photographed."""
 
 
 def evidence_of(scene: Reported) -> Evidence:
@@ -28,6 +34,8 @@ def evidence_of(scene: Reported) -> Evidence:
         if decision["component"] == "radiance_cache" and "value" in decision
     ]
     emitters = scene.readers["export"].table("emitters.parquet")
+    light, pixels = scene.readers["emission"], sum(view.width * view.height for view in capture.used)
+    density = min(pixels, EmissionOptions.pixels) / max(float(recovered.surface.areas.sum()), 1e-9)
     fitted = scene.readers["affines"]
     uncertainty = fitted.table("cells.parquet").get("uncertainty", ())
 
@@ -47,6 +55,7 @@ def evidence_of(scene: Reported) -> Evidence:
         stability=scene.document("segmentation").get("stability"),
         lamps=int(np.count_nonzero(emitters["kept"].astype(bool) & (emitters["kind"] == "area"))),
         environment=bool(np.any(recovered.light.environment)),
+        doubtful_area=doubtful_area(light.table("emitters.parquet"), light.table("radiance_cache.parquet"), density),
         misfit=emission.get("misfit"),
         light_spread=found(means, "rgb", "raw", "light_spread").get("mean"),
         held_out=psnr("rgb_held_out"),
@@ -67,6 +76,21 @@ def evidence_of(scene: Reported) -> Evidence:
         discrepancy=(affines.get("level_errors") or {}).get("normalised_discrepancy"),
         warnings=[(stage, says) for stage in NUMERICS for says in numerics.warnings([(stage, scene.document(stage))])],
     )
+
+
+def doubtful_area(emitters: Mapping[str, np.ndarray], cache: Mapping[str, np.ndarray], pixels_per_m2: float) -> float:
+    """Return the area in m^2 of what was taken for lamps without clear evidence: it hardly outshines what reflects (`BRIGHT`), or
+    is hardly photographed (`SHOWN`).
+
+    Args:
+        emitters, cache: columns of emitters.parquet and radiance_cache.parquet of stage emission.
+        pixels_per_m2: pixels of photographs per area of the mesh.
+    """
+    lamps, surface = (np.mean([table[f"radiance_{c}"] for c in "rgb"], axis=0) for table in (emitters, cache))
+    area, kept = emitters["area_m2"], emitters["kept"].astype(bool) & (emitters["kind"] == "area")
+    bright = lamps > BRIGHT * np.quantile(surface, 0.9) if len(surface) else np.zeros(len(lamps), bool)
+    shown = emitters["observations"] >= SHOWN * pixels_per_m2 * area
+    return float(area[kept & ~(bright & shown)].sum())
 
 
 def unfitted_share(objects: Mapping[str, np.ndarray]) -> float | None:
