@@ -1,0 +1,235 @@
+"""The bank of errors of the learned prior, which prior `simulated` draws as `errors: measured` (lab/docs/simulated.md#measured).
+
+In rooms that were kept back from training, the network predicts as the product does, and its errors are coded, turned into normal
+scores given the true value, and summed up as covariances of all predictions and quantities by distance, in one view and between
+views. `fit` finds a linear model of coregionalisation that has these covariances (Goulard and Voltz 1992).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from iif_core.priors.features import mirrored
+from iif_core.priors.hypotheses import combined
+from iif_core.reflectance.material import PROPERTIES
+from lab.prior import captures, evaluation
+from lab.simulated.measured import CHANNELS, SCORES, ErrorBank, coded
+
+SAMPLES = 16
+"""K: the eight hypotheses of the network and of the mirrored photograph."""
+BINS = (6, 5, 5, 5)
+"""Bins of equal count for the true values of the first four channels; metallic has two, split at METAL."""
+METAL = 0.5
+LENGTHS = (0.04, 0.12, 0.4, 1.2, np.inf)
+"""Correlation lengths in metres of the fields, a factor of three apart: from a few pixels of a photograph to the room."""
+EDGES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.6, 1.0, 1.7, 3.0)
+"""Edges in metres of the classes of distance."""
+RANK = 16
+"""Fields of one length."""
+PIXELS = 400
+"""Pixels of a view that are taken."""
+PAIRS = 40_000
+"""Pairs of pixels at most in one class of distance of a room."""
+SWEEPS = 300
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """Errors at n pixels of one room.
+
+    Attributes:
+        view: (n,) which view a pixel is of. points: (n, 3) surface that it shows, in metres.
+        truth: (n, C) coded truth. error: (n, K, C) coded prediction less truth.
+    """
+
+    view: NDArray
+    points: NDArray
+    truth: NDArray
+    error: NDArray
+
+
+def sample(capture: captures.Capture, weights: evaluation.Weights, seed: int) -> Sampled | None:
+    """Predict all views of a generated room, and take the errors at random pixels; None where nothing has truth."""
+    calibration = tuple(weights.recipe.get("scale_calibration", (1.0,) * len(PROPERTIES)))
+    by_name = {view.name: view for view in capture.used}
+    rows: list[tuple[NDArray, ...]] = []
+    for case in evaluation.cases(capture, weights, capture.given):
+        view = by_name[case.name]
+        both = weights.heads(case.inputs), weights.heads(mirrored(case.inputs))[:, :, ::-1]
+        maps = combined(np.concatenate(both)[..., :8], SAMPLES, calibration=calibration).maps
+        counts = np.logical_and.reduce(list(case.masks.values()))
+        rng = np.random.default_rng([seed, view.view_id])
+        at = rng.permutation(np.flatnonzero(counts))[:PIXELS]
+        true = np.concatenate([case.truth[name].reshape(*counts.shape, -1) for name in ("albedo", "roughness", "metallic")], -1)
+        own = coded(true.reshape(-1, 5)[at])
+        error = coded(maps.reshape(SAMPLES, -1, 5)[:, at]) - own
+        points = capture.points(view, capture.gbuffer(view)[0]).reshape(-1, 3)[at]
+        rows.append((np.full(len(at), view.view_id), points, own, np.moveaxis(error, 0, 1)))
+    return Sampled(*(np.concatenate(part) for part in zip(*rows, strict=True))) if rows else None
+
+
+def quantiles(rooms: list[Sampled]) -> tuple[NDArray, NDArray]:
+    """Return the true values (C, B) and the errors (C, B, K, Q) at SCORES; channels of fewer bins repeat their last one."""
+    truth, error = (np.concatenate([getattr(room, name) for room in rooms]) for name in ("truth", "error"))
+    middles: list[list[float]] = []
+    tables: list[list[NDArray]] = []
+    for c in range(len(CHANNELS)):
+        own = truth[:, c]
+        edges = np.unique(np.quantile(own, np.linspace(0, 1, BINS[c] + 1)[1:-1])) if c < len(BINS) else np.array([METAL])
+        number = np.digitize(own, edges)
+        taken = [number == i for i in range(len(edges) + 1) if (number == i).any()]
+        middles.append([float(own[use].mean()) for use in taken])
+        tables.append([np.quantile(error[use][:, :, c], ndtr(SCORES), axis=0).T for use in taken])
+    most = max(map(len, middles))
+    padded = [[*own, *(own[-1] + 1e-3 * (1 + np.arange(most - len(own))))] for own in middles]
+    return np.array(padded), np.stack([np.stack([*own, *[own[-1]] * (most - len(own))]) for own in tables])
+
+
+def normal_scores(bank: ErrorBank, room: Sampled) -> NDArray:
+    """Return the normal scores (n, K, C) of the errors of a room; the middle of those that a tied error may have."""
+    out = np.empty(room.error.shape, np.float32)
+    for c, table in enumerate(bank.quantiles):
+        low, share = bank.between(c, room.truth[:, c])
+        above = np.minimum(low + 1, len(table) - 1)
+        for k in range(out.shape[1]):
+            nodes = table[low, k] + share[:, None] * (table[above, k] - table[low, k])  # (n, Q) rises
+            value = room.error[:, k, c : c + 1]
+            out[:, k, c] = (_place(nodes, value, True) + _place(nodes, value, False)) / 2
+    return out
+
+
+def _place(nodes: NDArray, value: NDArray, first: bool) -> NDArray:
+    """Score (n,) of values (n, 1) among rising nodes (n, Q): the first or the last one at which the nodes have the value."""
+    below = (nodes < value if first else nodes <= value).sum(1)
+    high = np.clip(below, 1, nodes.shape[1] - 1)
+    row = np.arange(len(nodes))
+    left, right = nodes[row, high - 1], nodes[row, high]
+    part = np.clip((value[:, 0] - left) / np.maximum(right - left, 1e-9), 0, 1)
+    return SCORES[high - 1] + part * (SCORES[high] - SCORES[high - 1])
+
+
+@dataclass
+class Covariances:
+    """Means of products of scores (P, P) by class of distance, each room with the same weight.
+
+    Attributes:
+        same: (1 + J, P, P) within a view; the first is of a pixel with itself. other: (J, P, P) between two views.
+        same_shape, other_shape: the mean of exp(-d^2 / (2 l^2)) over the pairs of each class, for each length.
+    """
+
+    same: NDArray
+    other: NDArray
+    same_shape: NDArray
+    other_shape: NDArray
+
+
+def covariances(rooms: Iterable[tuple[NDArray, NDArray, NDArray]], seed: int = 0) -> Covariances:
+    """Sum up (scores (n, P), points (n, 3), view (n,)) of rooms. Both orders of a pair count, so the means are symmetric."""
+    classes = len(EDGES) - 1
+    parts: dict[tuple[bool, int], list[tuple[NDArray, NDArray]]] = {}
+    itself: list[NDArray] = []
+    for number, (scores, points, view) in enumerate(rooms):
+        rng = np.random.default_rng([seed, number])
+        itself.append(scores.T @ scores / len(scores))
+        for same, i, j, distance in _pairs(points, view, rng):
+            class_of = np.digitize(distance, EDGES[1:])
+            for b in range(classes):
+                at = np.flatnonzero(class_of == b)[:PAIRS]
+                if len(at) < 50:
+                    continue
+                mean = scores[i[at]].T @ scores[j[at]] / len(at)
+                shape = np.exp(-0.5 * (distance[at, None] / np.array(LENGTHS)) ** 2).mean(0)
+                parts.setdefault((same, b), []).append(((mean + mean.T) / 2, shape))
+    size = itself[0].shape[0]
+    mean_of = lambda key, i: np.mean([p[i] for p in parts[key]], 0) if key in parts else np.full((size, size)[: 2 - i], np.nan)  # noqa: E731
+    same, other = (np.stack([mean_of((kind, b), 0) for b in range(classes)]) for kind in (True, False))
+    shapes = [
+        np.stack([mean_of((kind, b), 1) if (kind, b) in parts else np.full(len(LENGTHS), np.nan) for b in range(classes)])
+        for kind in (True, False)
+    ]
+    same = np.concatenate([np.mean(itself, 0)[None], same])
+    return Covariances(same, other, np.concatenate([np.ones((1, len(LENGTHS))), shapes[0]]), shapes[1])
+
+
+def _pairs(points: NDArray, view: NDArray, rng: np.random.Generator) -> list[tuple[bool, NDArray, NDArray, NDArray]]:
+    """Pairs of different pixels in random order, once of one view and once of two: those within the shorter distances, which are
+    rare among random ones, and random ones."""
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(points).query_pairs(EDGES[5], output_type="ndarray")
+    near = rng.permutation(near)[: 20 * PAIRS]
+    far = rng.integers(0, len(points), (10 * PAIRS, 2))
+    distance = np.linalg.norm(points[far[:, 0]] - points[far[:, 1]], axis=1)
+    both = np.concatenate([near, far[distance >= EDGES[5]]])
+    i, j = both.T
+    distance = np.linalg.norm(points[i] - points[j], axis=1)
+    within = view[i] == view[j]
+    return [(same, i[use], j[use], distance[use]) for same, use in ((True, within), (False, ~within))]
+
+
+def coregionalisation(target: NDArray, shape: NDArray) -> NDArray:
+    """Find positive semidefinite matrices B_l with the least squares of target_j - sum_l shape_jl B_l (Goulard and Voltz 1992).
+
+    Args:
+        target: (J, P, P) symmetric. shape: (J, L) correlations.
+
+    Returns:
+        (L, P, P).
+    """
+    found = np.zeros((shape.shape[1], *target.shape[1:]))
+    rest = target.copy()
+    for _ in range(SWEEPS):
+        for number, own in enumerate(shape.T):
+            rest += own[:, None, None] * found[number]
+            values, vectors = np.linalg.eigh(np.tensordot(own, rest, 1) / (own**2).sum())
+            found[number] = (vectors * np.maximum(values, 0)) @ vectors.T
+            rest -= own[:, None, None] * found[number]
+    return found
+
+
+def _loadings(matrix: NDArray) -> NDArray:
+    """(P, R) whose product with itself is nearest to a positive semidefinite matrix."""
+    values, vectors = np.linalg.eigh(matrix)
+    return vectors[:, ::-1][:, :RANK] * np.sqrt(np.maximum(values[::-1][:RANK], 0))
+
+
+def fit(rooms: list[Sampled], facts: dict[str, Any]) -> ErrorBank:
+    """Make the bank of the errors of rooms.
+
+    First the part that views share is fitted to the covariances between views, then the part of each view to what those within a
+    view have in addition. Every variable is scaled to variance 1, so that the errors have exactly the measured quantiles.
+    """
+    truth, table = quantiles(rooms)
+    variables, none = SAMPLES * len(CHANNELS), np.zeros((len(LENGTHS), 0, 0))
+    bank = ErrorBank(truth, table, np.array(LENGTHS), none, none, none, facts)
+    found = covariances((normal_scores(bank, room).reshape(-1, variables), room.points, room.view) for room in rooms)
+    known = np.isfinite(found.other_shape[:, 0])
+    shared = coregionalisation(found.other[known], found.other_shape[known])
+    known = np.isfinite(found.same_shape[:, 0])
+    with_pixel = np.concatenate([found.same_shape, np.eye(len(found.same_shape))[:, :1]], 1)[known]  # d = 0 alone
+    left = found.same[known] - np.tensordot(found.same_shape[known], shared, 1)
+    *own, pixel = coregionalisation(left, with_pixel)
+    loadings = np.stack([_loadings(matrix) for matrix in (*shared, *own, pixel)])
+    loadings /= np.sqrt((loadings**2).sum((0, 2)))[:, None]
+    n = len(LENGTHS)
+    return ErrorBank(truth, table, bank.lengths, loadings[:n], loadings[n : 2 * n], loadings[-1], facts)
+
+
+def measure(files: list[Path], weights: evaluation.Weights) -> ErrorBank:
+    """Make the bank from files of generated rooms (`lab.prior.captures`)."""
+    rooms, seeds = [], []
+    for path in files:
+        seed = int(path.stem)
+        found = sample(captures.load(path), weights, seed)
+        if found is not None:
+            rooms.append(found)
+            seeds.append(seed)
+    pixels = sum(len(room.view) for room in rooms)
+    return fit(rooms, {"rooms": seeds, "pixels": pixels, "weights": weights.recipe.get("sha256", "")})
