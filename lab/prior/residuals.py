@@ -7,8 +7,9 @@ views. `fit` finds a linear model of coregionalisation that has these covariance
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +36,10 @@ RANK = 16
 """Fields of one length."""
 PIXELS = 400
 """Pixels of a view that are taken."""
-PAIRS = 40_000
-"""Pairs of pixels at most in one class of distance of a room."""
+NEAR = 0.2
+"""Distance in metres up to which all pairs are sought; beyond, random pairs are."""
+PAIRS, FEWEST = 20_000, 50
+"""Pairs of pixels in one class of distance of a room: at most, and at least to count."""
 SWEEPS = 300
 
 
@@ -105,6 +108,18 @@ def normal_scores(bank: ErrorBank, room: Sampled) -> NDArray:
     return out
 
 
+def standardised(bank: ErrorBank, room: Sampled) -> NDArray:
+    """Return the errors (n, K, C) less their mean, in standard deviations, both given the true value."""
+    mean, deviation = bank.moments()
+    out = np.empty(room.error.shape, np.float32)
+    for c in range(len(CHANNELS)):
+        low, share = bank.between(c, room.truth[:, c])
+        above = np.minimum(low + 1, mean.shape[1] - 1)
+        m, s = (a[c, low] + share[:, None] * (a[c, above] - a[c, low]) for a in (mean, deviation))
+        out[..., c] = (room.error[..., c] - m) / np.maximum(s, 1e-6)
+    return out
+
+
 def _place(nodes: NDArray, value: NDArray, first: bool) -> NDArray:
     """Score (n,) of values (n, 1) among rising nodes (n, Q): the first or the last one at which the nodes have the value."""
     below = (nodes < value if first else nodes <= value).sum(1)
@@ -115,63 +130,63 @@ def _place(nodes: NDArray, value: NDArray, first: bool) -> NDArray:
     return SCORES[high - 1] + part * (SCORES[high] - SCORES[high - 1])
 
 
-@dataclass
+@dataclass(frozen=True)
 class Covariances:
-    """Means of products of scores (P, P) by class of distance, each room with the same weight.
+    """Covariances of P variables by class of distance and by whether a pair of pixels lies in one view; rooms count alike.
 
     Attributes:
-        same: (1 + J, P, P) within a view; the first is of a pixel with itself. other: (J, P, P) between two views.
-        same_shape, other_shape: the mean of exp(-d^2 / (2 l^2)) over the pairs of each class, for each length.
+        mean: (1 + 2 J, P, P) symmetric: of a pixel with itself, then within a view, then between views; NaN = no pairs.
+        shape: (1 + 2 J, L) mean of exp(-d^2 / (2 l^2)) over the pairs, for each of LENGTHS.
     """
 
-    same: NDArray
-    other: NDArray
-    same_shape: NDArray
-    other_shape: NDArray
+    mean: NDArray
+    shape: NDArray
+
+    def correlations(self) -> NDArray:
+        """Return (2, 2, J, C) correlations of a channel: within a view or between views, of a sample with itself or others."""
+        k = self.mean.shape[1] // len(CHANNELS)
+        blocks = self.mean.reshape(-1, k, len(CHANNELS), k, len(CHANNELS))
+        of_channel = np.einsum("rkclc->rckl", blocks)
+        itself = np.einsum("rckk->rc", of_channel) / k
+        others = (of_channel.sum((2, 3)) - k * itself) / max(k * (k - 1), 1)
+        own = np.stack([itself, others])[:, 1:] / itself[0]
+        return np.moveaxis(own.reshape(2, 2, -1, len(CHANNELS)), 1, 0)
 
 
 def covariances(rooms: Iterable[tuple[NDArray, NDArray, NDArray]], seed: int = 0) -> Covariances:
-    """Sum up (scores (n, P), points (n, 3), view (n,)) of rooms. Both orders of a pair count, so the means are symmetric."""
+    """Sum up (values (n, P), points (n, 3), view (n,)) of rooms. Both orders of a pair count, so the means are symmetric."""
     classes = len(EDGES) - 1
-    parts: dict[tuple[bool, int], list[tuple[NDArray, NDArray]]] = {}
-    itself: list[NDArray] = []
-    for number, (scores, points, view) in enumerate(rooms):
-        rng = np.random.default_rng([seed, number])
-        itself.append(scores.T @ scores / len(scores))
-        for same, i, j, distance in _pairs(points, view, rng):
-            class_of = np.digitize(distance, EDGES[1:])
-            for b in range(classes):
-                at = np.flatnonzero(class_of == b)[:PAIRS]
-                if len(at) < 50:
-                    continue
-                mean = scores[i[at]].T @ scores[j[at]] / len(at)
-                shape = np.exp(-0.5 * (distance[at, None] / np.array(LENGTHS)) ** 2).mean(0)
-                parts.setdefault((same, b), []).append(((mean + mean.T) / 2, shape))
-    size = itself[0].shape[0]
-    mean_of = lambda key, i: np.mean([p[i] for p in parts[key]], 0) if key in parts else np.full((size, size)[: 2 - i], np.nan)  # noqa: E731
-    same, other = (np.stack([mean_of((kind, b), 0) for b in range(classes)]) for kind in (True, False))
-    shapes = [
-        np.stack([mean_of((kind, b), 1) if (kind, b) in parts else np.full(len(LENGTHS), np.nan) for b in range(classes)])
-        for kind in (True, False)
-    ]
-    same = np.concatenate([np.mean(itself, 0)[None], same])
-    return Covariances(same, other, np.concatenate([np.ones((1, len(LENGTHS))), shapes[0]]), shapes[1])
+    shape, count = np.zeros((1 + 2 * classes, len(LENGTHS))), np.zeros(1 + 2 * classes)
+    total: Any = 0
+    for number, (values, points, view) in enumerate(rooms):
+        own = np.zeros((len(count), values.shape[1], values.shape[1]))
+        i, j, distance = _pairs(points, np.random.default_rng([seed, number]))
+        kind = 1 + np.digitize(distance, EDGES[1:]) + np.where(view[i] == view[j], 0, classes)
+        kind[distance >= EDGES[-1]] = 0
+        for row in range(1, len(count)):
+            at = np.flatnonzero(kind == row)[:PAIRS]
+            if len(at) < FEWEST:
+                continue
+            mean = values[i[at]].T @ values[j[at]] / len(at)
+            own[row] = (mean + mean.T) / 2
+            shape[row] += np.exp(-0.5 * (distance[at, None] / np.array(LENGTHS)) ** 2).mean(0)
+            count[row] += 1
+        own[0] = values.T @ values / len(values)
+        shape[0], count[0] = shape[0] + 1, count[0] + 1
+        total = total + own
+    with np.errstate(invalid="ignore"):
+        return Covariances(total / count[:, None, None], shape / count[:, None])
 
 
-def _pairs(points: NDArray, view: NDArray, rng: np.random.Generator) -> list[tuple[bool, NDArray, NDArray, NDArray]]:
-    """Pairs of different pixels in random order, once of one view and once of two: those within the shorter distances, which are
-    rare among random ones, and random ones."""
+def _pairs(points: NDArray, rng: np.random.Generator) -> tuple[NDArray, NDArray, NDArray]:
+    """Pairs of pixels in random order (i, j, distance): near ones, which are rare among random ones, and random ones."""
     from scipy.spatial import cKDTree
 
-    near = cKDTree(points).query_pairs(EDGES[5], output_type="ndarray")
-    near = rng.permutation(near)[: 20 * PAIRS]
+    near = rng.permutation(cKDTree(points).query_pairs(NEAR, output_type="ndarray"))[: 20 * PAIRS]
     far = rng.integers(0, len(points), (10 * PAIRS, 2))
-    distance = np.linalg.norm(points[far[:, 0]] - points[far[:, 1]], axis=1)
-    both = np.concatenate([near, far[distance >= EDGES[5]]])
-    i, j = both.T
-    distance = np.linalg.norm(points[i] - points[j], axis=1)
-    within = view[i] == view[j]
-    return [(same, i[use], j[use], distance[use]) for same, use in ((True, within), (False, ~within))]
+    far = far[np.linalg.norm(points[far[:, 0]] - points[far[:, 1]], axis=1) >= NEAR]
+    i, j = np.concatenate([near, far]).T
+    return i, j, np.linalg.norm(points[i] - points[j], axis=1)
 
 
 def coregionalisation(target: NDArray, shape: NDArray) -> NDArray:
@@ -207,19 +222,24 @@ def fit(rooms: list[Sampled], facts: dict[str, Any]) -> ErrorBank:
     view have in addition. Every variable is scaled to variance 1, so that the errors have exactly the measured quantiles.
     """
     truth, table = quantiles(rooms)
-    variables, none = SAMPLES * len(CHANNELS), np.zeros((len(LENGTHS), 0, 0))
-    bank = ErrorBank(truth, table, np.array(LENGTHS), none, none, none, facts)
-    found = covariances((normal_scores(bank, room).reshape(-1, variables), room.points, room.view) for room in rooms)
-    known = np.isfinite(found.other_shape[:, 0])
-    shared = coregionalisation(found.other[known], found.other_shape[known])
-    known = np.isfinite(found.same_shape[:, 0])
-    with_pixel = np.concatenate([found.same_shape, np.eye(len(found.same_shape))[:, :1]], 1)[known]  # d = 0 alone
-    left = found.same[known] - np.tensordot(found.same_shape[known], shared, 1)
-    *own, pixel = coregionalisation(left, with_pixel)
-    loadings = np.stack([_loadings(matrix) for matrix in (*shared, *own, pixel)])
+    n, none = len(LENGTHS), np.zeros((0, 0))
+    bank = ErrorBank(truth, table, np.array(LENGTHS), none, none, none, none, facts)
+
+    def of_rooms(values: Callable[[Sampled], NDArray]) -> Covariances:
+        return covariances((values(room).reshape(len(room.view), -1), room.points, room.view) for room in rooms)
+
+    found = of_rooms(partial(normal_scores, bank))
+    known = np.isfinite(found.shape[:, 0])
+    between = known & (np.arange(len(known)) >= (len(known) + 1) // 2)
+    within = known & ~between
+    shared = coregionalisation(found.mean[between], found.shape[between])
+    left = found.mean[within] - np.tensordot(found.shape[within], shared, 1)
+    itself = np.eye(within.sum())[:, :1]
+    own = coregionalisation(left, np.concatenate([found.shape[within], itself], 1))
+    loadings = np.stack([_loadings(matrix) for matrix in (*shared, *own)])
     loadings /= np.sqrt((loadings**2).sum((0, 2)))[:, None]
-    n = len(LENGTHS)
-    return ErrorBank(truth, table, bank.lengths, loadings[:n], loadings[n : 2 * n], loadings[-1], facts)
+    correlation = of_rooms(partial(standardised, bank)).correlations()
+    return ErrorBank(truth, table, bank.lengths, loadings[:n], loadings[n:-1], loadings[-1], correlation, facts)
 
 
 def measure(files: list[Path], weights: evaluation.Weights) -> ErrorBank:

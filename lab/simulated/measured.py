@@ -37,6 +37,8 @@ class ErrorBank:
         lengths: (L,) correlation lengths in metres of the fields; infinity = one value for the scene.
         shared: (L, P, R) loadings of the fields that all views share. own: (L, P, R) of those that each view has for itself.
         pixel: (P, R) loadings of noise that each pixel has for itself.
+        correlation: (2, 2, J, C) as it was measured, of errors standardised given the true value, by class of distance: within a
+            view or between views, of a sample with itself or with others. Nothing is drawn from it.
         facts: how the bank was made.
     """
 
@@ -46,12 +48,23 @@ class ErrorBank:
     shared: NDArray
     own: NDArray
     pixel: NDArray
+    correlation: NDArray
     facts: dict[str, Any]
 
     @property
     def samples(self) -> int:
         """K, the largest number of predictions."""
         return self.quantiles.shape[2]
+
+    def moments(self) -> tuple[NDArray, NDArray]:
+        """Return mean and standard deviation (C, B, K) of the errors at `truth`: those of `quantiles` under normal scores."""
+        from scipy.special import ndtr
+
+        fine = np.linspace(-4, 4, 401)
+        edges = ndtr(np.concatenate([[-np.inf], (fine[1:] + fine[:-1]) / 2, [np.inf]]))
+        values = np.apply_along_axis(lambda q: np.interp(fine, SCORES, q), -1, self.quantiles)
+        mean = values @ np.diff(edges)
+        return mean, np.sqrt(np.maximum((values - mean[..., None]) ** 2 @ np.diff(edges), 0))
 
     def save(self, path: Path) -> None:
         """Write the bank in half precision."""
