@@ -1,8 +1,8 @@
 """The bank of errors of the learned prior, which prior `simulated` draws as `errors: measured` (lab/docs/simulated.md#measured).
 
 In rooms that were kept back from training, the network predicts as the product does, and its errors are coded, turned into normal
-scores given the true value, and summed up as covariances of all predictions and quantities by distance, in one view and between
-views. `fit` finds a linear model of coregionalisation that has these covariances (Goulard and Voltz 1992).
+scores given the true value, and summed up as correlations of all predictions and channels by distance, in one view and between
+views. `fit` finds a linear model of coregionalisation that has these correlations (Goulard and Voltz 1992).
 """
 
 from __future__ import annotations
@@ -131,8 +131,8 @@ def _place(nodes: NDArray, value: NDArray, first: bool) -> NDArray:
 
 
 @dataclass(frozen=True)
-class Covariances:
-    """Covariances of P variables by class of distance and by whether a pair of pixels lies in one view; rooms count alike.
+class Correlations:
+    """Correlations of P variables by class of distance and by whether a pair of pixels lies in one view; rooms count alike.
 
     Attributes:
         mean: (1 + 2 J, P, P) symmetric: of a pixel with itself, then within a view, then between views; NaN = no pairs.
@@ -142,40 +142,47 @@ class Covariances:
     mean: NDArray
     shape: NDArray
 
-    def correlations(self) -> NDArray:
+    def of_channels(self) -> NDArray:
         """Return (2, 2, J, C) correlations of a channel: within a view or between views, of a sample with itself or others."""
         k = self.mean.shape[1] // len(CHANNELS)
         blocks = self.mean.reshape(-1, k, len(CHANNELS), k, len(CHANNELS))
         of_channel = np.einsum("rkclc->rckl", blocks)
         itself = np.einsum("rckk->rc", of_channel) / k
         others = (of_channel.sum((2, 3)) - k * itself) / max(k * (k - 1), 1)
-        own = np.stack([itself, others])[:, 1:] / itself[0]
-        return np.moveaxis(own.reshape(2, 2, -1, len(CHANNELS)), 1, 0)
+        own = np.stack([itself, others])[:, 1:].reshape(2, 2, -1, len(CHANNELS))
+        return np.moveaxis(own, 1, 0)
 
 
-def covariances(rooms: Iterable[tuple[NDArray, NDArray, NDArray]], seed: int = 0) -> Covariances:
-    """Sum up (values (n, P), points (n, 3), view (n,)) of rooms. Both orders of a pair count, so the means are symmetric."""
+def correlations(rooms: Iterable[tuple[NDArray, NDArray, NDArray]], seed: int = 0) -> Correlations:
+    """Sum up (values (n, P) of mean 0, points (n, 3), view (n,)) of rooms; both orders of a pair count.
+
+    The variances of a class are those of its own pairs: pixels that lie close together show what is close to the camera, which
+    has larger errors than the average.
+    """
     classes = len(EDGES) - 1
     shape, count = np.zeros((1 + 2 * classes, len(LENGTHS))), np.zeros(1 + 2 * classes)
-    total: Any = 0
+    product: Any = 0
+    square: Any = 0
     for number, (values, points, view) in enumerate(rooms):
-        own = np.zeros((len(count), values.shape[1], values.shape[1]))
+        products = np.zeros((len(count), values.shape[1], values.shape[1]))
+        squares = np.zeros(products.shape[:2])
         i, j, distance = _pairs(points, np.random.default_rng([seed, number]))
         kind = 1 + np.digitize(distance, EDGES[1:]) + np.where(view[i] == view[j], 0, classes)
         kind[distance >= EDGES[-1]] = 0
-        for row in range(1, len(count)):
-            at = np.flatnonzero(kind == row)[:PAIRS]
-            if len(at) < FEWEST:
+        for row in range(len(count)):
+            at = np.flatnonzero(kind == row)[:PAIRS] if row else np.arange(0)
+            left, right = (values[i[at]], values[j[at]]) if row else (values, values)
+            if len(left) < FEWEST:
                 continue
-            mean = values[i[at]].T @ values[j[at]] / len(at)
-            own[row] = (mean + mean.T) / 2
-            shape[row] += np.exp(-0.5 * (distance[at, None] / np.array(LENGTHS)) ** 2).mean(0)
+            mean = left.T @ right / len(left)
+            products[row] = (mean + mean.T) / 2
+            squares[row] = ((left**2).mean(0) + (right**2).mean(0)) / 2
+            shape[row] += np.exp(-0.5 * (distance[at, None] / np.array(LENGTHS)) ** 2).mean(0) if row else 1
             count[row] += 1
-        own[0] = values.T @ values / len(values)
-        shape[0], count[0] = shape[0] + 1, count[0] + 1
-        total = total + own
-    with np.errstate(invalid="ignore"):
-        return Covariances(total / count[:, None, None], shape / count[:, None])
+        product, square = product + products, square + squares
+    with np.errstate(invalid="ignore", divide="ignore"):
+        size = np.sqrt(square)
+        return Correlations(product / (size[:, :, None] * size[:, None]), shape / count[:, None])
 
 
 def _pairs(points: NDArray, rng: np.random.Generator) -> tuple[NDArray, NDArray, NDArray]:
@@ -218,15 +225,15 @@ def _loadings(matrix: NDArray) -> NDArray:
 def fit(rooms: list[Sampled], facts: dict[str, Any]) -> ErrorBank:
     """Make the bank of the errors of rooms.
 
-    First the part that views share is fitted to the covariances between views, then the part of each view to what those within a
+    First the part that views share is fitted to the correlations between views, then the part of each view to what those within a
     view have in addition. Every variable is scaled to variance 1, so that the errors have exactly the measured quantiles.
     """
     truth, table = quantiles(rooms)
     n, none = len(LENGTHS), np.zeros((0, 0))
     bank = ErrorBank(truth, table, np.array(LENGTHS), none, none, none, none, facts)
 
-    def of_rooms(values: Callable[[Sampled], NDArray]) -> Covariances:
-        return covariances((values(room).reshape(len(room.view), -1), room.points, room.view) for room in rooms)
+    def of_rooms(values: Callable[[Sampled], NDArray]) -> Correlations:
+        return correlations((values(room).reshape(len(room.view), -1), room.points, room.view) for room in rooms)
 
     found = of_rooms(partial(normal_scores, bank))
     known = np.isfinite(found.shape[:, 0])
@@ -238,7 +245,7 @@ def fit(rooms: list[Sampled], facts: dict[str, Any]) -> ErrorBank:
     own = coregionalisation(left, np.concatenate([found.shape[within], itself], 1))
     loadings = np.stack([_loadings(matrix) for matrix in (*shared, *own)])
     loadings /= np.sqrt((loadings**2).sum((0, 2)))[:, None]
-    correlation = of_rooms(partial(standardised, bank)).correlations()
+    correlation = of_rooms(partial(standardised, bank)).of_channels()
     return ErrorBank(truth, table, bank.lengths, loadings[:n], loadings[n:-1], loadings[-1], correlation, facts)
 
 

@@ -8,32 +8,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 WAVES = 128
-"""Waves of a field: its correlation over space is off by about 1 / sqrt(2 WAVES) = 6 % of its variance."""
+"""Waves of a field: its correlation over space is off by about 1 / sqrt(2 WAVES), 0.06."""
 
 
 class Field:
     """Stationary Gaussian fields over space with one correlation length, by random Fourier features (Rahimi and Recht 2007).
 
-    Each is sqrt(1 / W) sum_w (a_w cos(k_w x) + b_w sin(k_w x)) with k_w ~ N(0, I / length^2) and a_w, b_w ~ N(0, 1): normal with
-    mean 0 and variance 1 at every point, and with the correlation exp(-d^2 / (2 length^2)) at distance d.
+    Each is sqrt(2 / W) sum_w cos(k_w x + u_w) with k_w ~ N(0, I / length^2) and uniform phases u_w. It has mean 0, variance 1 and
+    the correlation exp(-d^2 / (2 length^2)) at distance d, and is nearly normal. Its variance over a large scene is 1 as well.
 
     Args:
         points: (n, 3) places in metres; NaN or infinity = no place, which counts as the origin.
         length: correlation length > 0 in metres; infinity = one value for all points.
-        keys: integers that the waves k_w are hashes of. Fields of equal keys share them, but not a_w and b_w.
+        keys: integers that the waves k_w are hashes of. Fields of equal keys share them, but not the phases.
     """
 
     def __init__(self, points: NDArray, length: float, *keys: int):
         wave = standard_normal(*keys, np.arange(WAVES)[:, None], np.arange(3)[None]) / length
         place = np.where(np.isfinite(points), points, 0).astype(np.float64)
-        phase = (place @ wave.T).astype(np.float32)
-        self._waves = np.concatenate([np.cos(phase), np.sin(phase)], 1) * np.float32(WAVES**-0.5)
+        angle = (place @ wave.T).astype(np.float32)
+        self._waves = np.concatenate([np.cos(angle), -np.sin(angle)], 1) * np.float32((2 / WAVES) ** 0.5)
 
     def __call__(self, *keys: int | NDArray) -> NDArray:
         """Return (n, ...) float32: a field for each element of the keys, integers that broadcast to one shape."""
         broadcast = np.broadcast_arrays(*(np.asarray(key, np.int64) for key in keys))
-        amplitude = standard_normal(*(key.ravel() for key in broadcast), np.arange(2 * WAVES)[:, None])
-        return (self._waves @ amplitude.astype(np.float32)).reshape(len(self._waves), *broadcast[0].shape)
+        phase = 2 * np.pi * unit_interval(*(key.ravel() for key in broadcast), np.arange(WAVES)[:, None])
+        weight = np.concatenate([np.cos(phase), np.sin(phase)]).astype(np.float32)
+        return (self._waves @ weight).reshape(len(self._waves), *broadcast[0].shape)
 
 
 def tag(name: str) -> int:

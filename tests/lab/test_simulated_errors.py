@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lab.prior import residuals
-from lab.prior.residuals import EDGES, Sampled, covariances, fit
+from lab.prior.residuals import EDGES, Sampled, correlations, fit
 from lab.settings.prior import MEASURED_SAMPLES, SimulatedPrior
 from lab.simulated import prior as simulated
 from lab.simulated.errors import RGBX, SimulatedErrors, simulate_predictions
@@ -172,7 +172,7 @@ def test_drawn_errors_have_the_correlations_that_were_measured(drawn):
     """Over distance, within a view and between views, of a sample with itself and with others."""
     errors = bank()
     values = ((residuals.standardised(errors, room).reshape(len(room.view), -1), room.points, room.view) for room in drawn)
-    found = covariances(values).correlations()
+    found = correlations(values).of_channels()
     both = np.isfinite(found) & np.isfinite(errors.correlation)
     assert both.any((2, 3)).all()
     difference = (found - errors.correlation)[both]
