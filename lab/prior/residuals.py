@@ -1,19 +1,20 @@
 """The bank of errors of the learned prior, which prior `simulated` draws as `errors: measured` (lab/docs/simulated.md#measured).
 
-In rooms that were kept back from training, the network predicts as the product does, and its errors are coded, turned into normal
-scores given the true value, and summed up as correlations of all predictions and channels by distance, in one view and between
-views. `fit` finds a linear model of coregionalisation that has these correlations (Goulard and Voltz 1992).
+In rooms that were kept back from training, the network predicts as the product does, and its errors are coded, standardised given
+the true value, and summed up as correlations of all predictions and channels by distance, in one view and between views. `fit`
+finds a linear model of coregionalisation of normal scores whose errors have these correlations (Goulard and Voltz 1992).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import partial
+from math import factorial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.hermite_e import hermeval
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
@@ -21,7 +22,7 @@ from iif_core.priors.features import mirrored
 from iif_core.priors.hypotheses import combined
 from iif_core.reflectance.material import PROPERTIES
 from lab.prior import captures, evaluation
-from lab.simulated.measured import CHANNELS, SCORES, ErrorBank, coded
+from lab.simulated.measured import CHANNELS, SCORES, ErrorBank, coded, normal_grid
 
 SAMPLES = 16
 """K: the eight hypotheses of the network and of the mirrored photograph."""
@@ -34,6 +35,8 @@ EDGES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.6, 1.0, 1.7, 3.0)
 """Edges in metres of the classes of distance."""
 RANK = 16
 """Fields of one length."""
+ORDER = 12
+"""Hermite polynomials of an error as a function of its normal score."""
 PIXELS = 400
 """Pixels of a view that are taken."""
 NEAR = 0.2
@@ -95,19 +98,6 @@ def quantiles(rooms: list[Sampled]) -> tuple[NDArray, NDArray]:
     return np.array(padded), np.stack([np.stack([*own, *[own[-1]] * (most - len(own))]) for own in tables])
 
 
-def normal_scores(bank: ErrorBank, room: Sampled) -> NDArray:
-    """Return the normal scores (n, K, C) of the errors of a room; the middle of those that a tied error may have."""
-    out = np.empty(room.error.shape, np.float32)
-    for c, table in enumerate(bank.quantiles):
-        low, share = bank.between(c, room.truth[:, c])
-        above = np.minimum(low + 1, len(table) - 1)
-        for k in range(out.shape[1]):
-            nodes = table[low, k] + share[:, None] * (table[above, k] - table[low, k])  # (n, Q) rises
-            value = room.error[:, k, c : c + 1]
-            out[:, k, c] = (_place(nodes, value, True) + _place(nodes, value, False)) / 2
-    return out
-
-
 def standardised(bank: ErrorBank, room: Sampled) -> NDArray:
     """Return the errors (n, K, C) less their mean, in standard deviations, both given the true value."""
     mean, deviation = bank.moments()
@@ -120,14 +110,35 @@ def standardised(bank: ErrorBank, room: Sampled) -> NDArray:
     return out
 
 
-def _place(nodes: NDArray, value: NDArray, first: bool) -> NDArray:
-    """Score (n,) of values (n, 1) among rising nodes (n, Q): the first or the last one at which the nodes have the value."""
-    below = (nodes < value if first else nodes <= value).sum(1)
-    high = np.clip(below, 1, nodes.shape[1] - 1)
-    row = np.arange(len(nodes))
-    left, right = nodes[row, high - 1], nodes[row, high]
-    part = np.clip((value[:, 0] - left) / np.maximum(right - left, 1e-9), 0, 1)
-    return SCORES[high - 1] + part * (SCORES[high] - SCORES[high - 1])
+def of_scores(bank: ErrorBank, rooms: list[Sampled], correlation: NDArray) -> NDArray:
+    """Return the correlations (..., P, P) of normal scores whose errors have these correlations (Nataf's transformation).
+
+    An error is a rising function of its score: a sum of Hermite polynomials with coefficients a_n. Two errors of one channel are
+    then correlated by sum_n a_n^2 r^n where their scores are by r. Of two channels, the coefficients are means over the truth.
+    """
+    z, weight = normal_grid()
+    powers = np.arange(1, ORDER + 1)
+    basis = np.stack([hermeval(z, np.eye(ORDER + 1)[n]) / np.sqrt(float(factorial(n))) for n in powers], 1) * weight[:, None]
+    mean, deviation = bank.moments()
+    error = (bank.at_scores(z) - mean[..., None]) / np.maximum(deviation, 1e-6)[..., None]
+    coefficient = error @ basis  # (C, B, K, n)
+    share = np.zeros(mean.shape[:2])
+    for c in range(len(CHANNELS)):
+        low, part = bank.between(c, np.concatenate([room.truth[:, c] for room in rooms]))
+        share[c] = np.bincount(low, 1 - part, share.shape[1])
+        share[c] += np.bincount(np.minimum(low + 1, share.shape[1] - 1), part, share.shape[1])
+    share /= share.sum(1, keepdims=True)
+    middle = np.einsum("cb,cbkn->cn", share, coefficient) / bank.samples
+    square = np.einsum("cb,cbkn->cn", share, coefficient**2) / bank.samples
+    grid = np.linspace(-1, 1, 401)
+    blocks = correlation.reshape(*correlation.shape[:-2], bank.samples, len(CHANNELS), bank.samples, len(CHANNELS))
+    out = np.empty_like(blocks)
+    for c in range(len(CHANNELS)):
+        for other in range(len(CHANNELS)):
+            terms = square[c] / square[c].sum() if c == other else middle[c] * middle[other]
+            rising = np.maximum.accumulate((terms * grid[:, None] ** powers).sum(1)) + 1e-9 * grid
+            out[..., c, :, other] = np.interp(blocks[..., c, :, other], rising, grid)
+    return out.reshape(correlation.shape)
 
 
 @dataclass(frozen=True)
@@ -231,22 +242,19 @@ def fit(rooms: list[Sampled], facts: dict[str, Any]) -> ErrorBank:
     truth, table = quantiles(rooms)
     n, none = len(LENGTHS), np.zeros((0, 0))
     bank = ErrorBank(truth, table, np.array(LENGTHS), none, none, none, none, facts)
-
-    def of_rooms(values: Callable[[Sampled], NDArray]) -> Correlations:
-        return correlations((values(room).reshape(len(room.view), -1), room.points, room.view) for room in rooms)
-
-    found = of_rooms(partial(normal_scores, bank))
+    values = ((standardised(bank, room).reshape(len(room.view), -1), room.points, room.view) for room in rooms)
+    found = correlations(values)
     known = np.isfinite(found.shape[:, 0])
+    scores = np.where(known[:, None, None], of_scores(bank, rooms, found.mean), np.nan)
     between = known & (np.arange(len(known)) >= (len(known) + 1) // 2)
     within = known & ~between
-    shared = coregionalisation(found.mean[between], found.shape[between])
-    left = found.mean[within] - np.tensordot(found.shape[within], shared, 1)
+    shared = coregionalisation(scores[between], found.shape[between])
+    left = scores[within] - np.tensordot(found.shape[within], shared, 1)
     itself = np.eye(within.sum())[:, :1]
     own = coregionalisation(left, np.concatenate([found.shape[within], itself], 1))
     loadings = np.stack([_loadings(matrix) for matrix in (*shared, *own)])
     loadings /= np.sqrt((loadings**2).sum((0, 2)))[:, None]
-    correlation = of_rooms(partial(standardised, bank)).of_channels()
-    return ErrorBank(truth, table, bank.lengths, loadings[:n], loadings[n:-1], loadings[-1], correlation, facts)
+    return ErrorBank(truth, table, bank.lengths, loadings[:n], loadings[n:-1], loadings[-1], found.of_channels(), facts)
 
 
 def measure(files: list[Path], weights: evaluation.Weights) -> ErrorBank:

@@ -58,13 +58,14 @@ class ErrorBank:
 
     def moments(self) -> tuple[NDArray, NDArray]:
         """Return mean and standard deviation (C, B, K) of the errors at `truth`: those of `quantiles` under normal scores."""
-        from scipy.special import ndtr
+        z, weight = normal_grid()
+        values = self.at_scores(z)
+        mean = values @ weight
+        return mean, np.sqrt((values - mean[..., None]) ** 2 @ weight)
 
-        fine = np.linspace(-4, 4, 401)
-        edges = ndtr(np.concatenate([[-np.inf], (fine[1:] + fine[:-1]) / 2, [np.inf]]))
-        values = np.apply_along_axis(lambda q: np.interp(fine, SCORES, q), -1, self.quantiles)
-        mean = values @ np.diff(edges)
-        return mean, np.sqrt(np.maximum((values - mean[..., None]) ** 2 @ np.diff(edges), 0))
+    def at_scores(self, z: NDArray) -> NDArray:
+        """Return the errors (C, B, K, n) at `truth` that have the normal scores z (n,)."""
+        return np.apply_along_axis(lambda q: np.interp(z, SCORES, q), -1, self.quantiles)
 
     def save(self, path: Path) -> None:
         """Write the bank in half precision."""
@@ -103,6 +104,15 @@ class ErrorBank:
         at = np.interp(truth, nodes, np.arange(len(nodes)))
         low = np.minimum(at.astype(int), max(len(nodes) - 2, 0))
         return low, at - low
+
+
+def normal_grid() -> tuple[NDArray, NDArray]:
+    """Return normal scores (401,) and the probability that each stands for."""
+    from scipy.special import ndtr
+
+    z = np.linspace(-4, 4, 401)
+    edges = ndtr((z[1:] + z[:-1]) / 2)
+    return z, np.diff(edges, prepend=0, append=1)
 
 
 @lru_cache(1)
