@@ -11,6 +11,7 @@ The way of the data, one module for each step:
     shards          crops as files, and a line about each room
     losses, training        crops -> weights
     evaluation, scenes      errors and calibration on rooms that are kept back, and on captures with truth
+    residuals       errors of the weights as prior `simulated` draws them
     export, pack    weights for the product; everything that a GPU machine without a network needs
 
 `lab/docs/prior.md` has one command for each step. No test scene and no built-in room is ever trained on.

@@ -31,7 +31,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
     out = argparse.ArgumentParser(prog="python -m lab.prior", description=__doc__)
     commands = out.add_subparsers(dest="command", required=True)
-    for add in (_add_rooms, _add_train, _add_evaluate, _add_export, _add_pack):
+    for add in (_add_rooms, _add_train, _add_evaluate, _add_residuals, _add_export, _add_pack):
         add(commands)
     return out
 
@@ -170,7 +170,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     share of the errors inside of the stated 68 % intervals, metal found, and use of the heads."""
     import json
 
-    from lab.prior import evaluation, machine, shards
+    from lab.prior import evaluation, machine
 
     machine.prepare(options.device, 2)
     weights = evaluation.Weights.load(options.weights, options.device)
@@ -179,12 +179,7 @@ def _evaluate(options: argparse.Namespace) -> None:
             options.captures, weights, options.objects == "given", options.views, options.retinex
         )
     elif options.rooms:
-        files = sorted((options.rooms / "rooms").glob("[0-9]*.npz"), key=lambda path: int(path.stem))
-        kept = [path for path in files if options.all_rooms or shards.is_held_out(int(path.stem))]
-        if not kept:
-            raise InputError(
-                f"{options.rooms}: none of its {len(files)} rooms is one that is kept back (one in {shards.HELD_OUT[0]})"
-            )
+        kept = _kept_back(options.rooms, options.all_rooms)
         sources = evaluation.held_out_rooms(kept[: options.limit or None], weights, options.views, options.retinex)
     else:
         raise InputError("neither --rooms nor --captures is given; name what to measure on")
@@ -192,6 +187,38 @@ def _evaluate(options: argparse.Namespace) -> None:
     print(evaluation.table(report))
     if options.report:
         options.report.write_text(json.dumps(report, indent=1) + "\n")
+
+
+def _add_residuals(commands: argparse._SubParsersAction) -> None:
+    p = commands.add_parser("residuals", help="measure the errors that prior `simulated` draws", description=_residuals.__doc__)
+    p.add_argument("weights", type=Path, help="folder with weights.safetensors and recipe.json")
+    p.add_argument("rooms", type=Path, help="folder that `rooms` filled")
+    p.add_argument("target", type=Path, help="file that is written, such as lab/simulated/measured_errors.npz")
+    p.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    p.set_defaults(run=_residuals)
+
+
+def _residuals(options: argparse.Namespace) -> None:
+    """Measure the errors of weights on generated rooms that were kept back from training, and write what is needed to draw such
+    errors for any scene."""
+    from lab.prior import evaluation, machine, residuals
+
+    machine.prepare(options.device, 1)
+    files = _kept_back(options.rooms, False)
+    bank = residuals.measure(files, evaluation.Weights.load(options.weights, options.device))
+    bank.save(options.target)
+    print(f"{options.target}: {bank.facts['pixels']} pixels of {len(bank.facts['rooms'])} rooms")
+
+
+def _kept_back(folder: Path, every: bool) -> list[Path]:
+    """List the files of the rooms of a folder that no training has seen, or of every room."""
+    from lab.prior import shards
+
+    files = sorted((folder / "rooms").glob("[0-9]*.npz"), key=lambda path: int(path.stem))
+    kept = [path for path in files if every or shards.is_held_out(int(path.stem))]
+    if not kept:
+        raise InputError(f"{folder}: none of its {len(files)} rooms is one that is kept back (one in {shards.HELD_OUT[0]})")
+    return kept
 
 
 def _add_export(commands: argparse._SubParsersAction) -> None:

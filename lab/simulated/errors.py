@@ -1,18 +1,19 @@
-"""Prior `simulated`: ground truth with the errors of a single-view model (lab/docs/simulated.md#simulated, Eq. P.3 to P.9).
+"""Prior `simulated`: ground truth with the errors of a single-view model (lab/docs/simulated.md#simulated, Eq. P.3 to P.9, P.30).
 
 Every random number is a hash of (seed, name, object, view, sample) (Eq. P.2), so it does not depend on the order of evaluation,
-on the size of the image, or on which other objects are in view. `strength` multiplies every error; 0 returns the truth exactly.
+on the size of the image, or on which other objects are in view. Where errors are not tied to objects, a Gaussian field in space
+takes the place of each number of an object. `strength` multiplies every error; 0 returns the truth exactly.
 """
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.errors import InputError
+from lab.simulated.fields import Field, pixel_normal, standard_normal, tag, unit_interval
 
 
 @dataclass(frozen=True)
@@ -70,29 +71,36 @@ class SimulatedErrors:
 
 RGBX = SimulatedErrors()
 """Errors of the size that the paper reports for RGB-X."""
+LENGTH = 0.5
+"""Correlation length of fields in metres: between that of a chair and that of a wall."""
 
 
 def simulate_predictions(
     albedo: NDArray,
     roughness: NDArray,
     metallic: NDArray,
-    object_id: NDArray,
+    object_id: NDArray | None,
     samples: int,
     view: int,
     seed: int,
     strength: float = 1.0,
     shading: NDArray | None = None,
     errors: SimulatedErrors = RGBX,
+    points: NDArray | None = None,
+    length: float = LENGTH,
 ) -> NDArray:
     """Simulate K predictions of a view.
 
     Args:
         albedo: (H, W, 3) linear truth; roughness, metallic: (H, W).
-        object_id: (H, W) int, the units that errors belong to; -1 = none, which is one unit. samples: K >= 1.
+        object_id: (H, W) int, the units that errors belong to; -1 = none, which is one unit. Not read where there are `points`.
+        samples: K >= 1.
         view, seed: any integers; equal ones give equal errors.
         strength: 0 = truth, 1 = the sizes in `errors`, at most 4.
         shading: (H, W) true shading > 0 up to scale (see `shading_proxy`); None = nothing leaks.
         errors: sizes at strength 1.
+        points: (H, W, 3) surface in metres, NaN = none: the errors are fields in space and not tied to objects. None = they are.
+        length: correlation length of the fields in metres.
 
     Returns:
         (K, H, W, 5) float32: linear albedo, perceptual roughness, metallic, in [0, 1].
@@ -102,15 +110,20 @@ def simulate_predictions(
     """
     if samples < 1 or not 0 <= strength <= 4:
         raise InputError(f"simulated prior: samples {samples} (at least 1), strength {strength} (between 0 and 4)")
-    shape = np.shape(object_id)
+    shape = np.shape(object_id if points is None else points)[:2]
     truth = _truth(albedo, roughness, metallic, shading, shape)
     if strength == 0 or truth.size == 0:
         return np.repeat(np.clip(truth, 0, 1)[None], samples, 0)
 
     e, s = errors, strength
-    objects, unit = np.unique(object_id, return_inverse=True)
+    draw: _Draws
+    if points is None:
+        objects, unit = np.unique(object_id, return_inverse=True)
+        draw = _Draws(seed, view, samples, objects.astype(np.int64))
+    else:  # every pixel is a unit of its own
+        unit = np.arange(truth[..., 0].size)
+        draw = _FieldDraws(seed, view, samples, np.reshape(points, (-1, 3)), length)
     unit = unit.reshape(shape)
-    draw = _Draws(seed, objects, view, samples)
     patterns = _patterns(shape, draw, e)
     blurred = _blurred(truth[..., :3], e)
     log_shading = _log_shading(shading, shape)
@@ -235,56 +248,45 @@ def _patterns(shape: tuple[int, ...], draw: _Draws, e: SimulatedErrors, waves: i
 
 
 class _Draws:
-    """Random numbers that are hashes of what they are used for (Eq. P.2)."""
+    """Random numbers of objects and pictures (Eq. P.2)."""
 
-    def __init__(self, seed: int, objects: NDArray, view: int, samples: int):
-        self.seed, self.view, self.samples = seed, view, samples
-        self.objects = objects.astype(np.int64)
-        self.k = np.arange(samples)
+    def __init__(self, seed: int, view: int, samples: int, objects: NDArray):
+        self.seed, self.view, self.samples, self.objects = seed, view, samples, objects
+        k = np.arange(samples)
+        self.keys: dict[str, tuple] = {"object": (), "view": (view,), "sample": (view, k)}
 
     def uniform(self, what: str, level: str, channels: int = 1) -> NDArray:
         """Uniforms in (0, 1): (channels, n, K), or (channels, n, 1) for levels above the sample."""
-        channel, unit, k = np.arange(channels)[:, None, None], self.objects[None, :, None], self.k[None, None, :]
-        keys: dict[str, tuple] = {"object": (), "view": (self.view,), "sample": (self.view, k)}
-        return _unit_interval(_hash(self.seed, _tag(what, level), channel, unit, *keys[level]))
+        channel, unit = np.arange(channels)[:, None, None], self.objects[None, :, None]
+        return unit_interval(self.seed, tag(f"{what}/{level}"), channel, unit, *self.keys[level])
 
     def normal(self, what: str, level: str, channels: int = 1) -> NDArray:
-        return _normal(self.uniform(what, level, channels))
+        from scipy.special import ndtri
+
+        return ndtri(self.uniform(what, level, channels))
 
     def picture_uniform(self, what: str, k: int, n: int) -> NDArray:
-        return _unit_interval(_hash(self.seed, _tag(what, "picture"), np.arange(n), self.view, k))
+        return unit_interval(self.seed, tag(f"{what}/picture"), np.arange(n), self.view, k)
 
     def picture_normal(self, what: str, k: int, n: int) -> NDArray:
-        return _normal(self.picture_uniform(what, k, n))
+        return standard_normal(self.seed, tag(f"{what}/picture"), np.arange(n), self.view, k)
 
     def pixel_normal(self, k: int, shape: tuple[int, ...]) -> NDArray:
-        key = _hash(self.seed, _tag("noise", "pixel"), self.view, k)
-        generator = np.random.Generator(np.random.Philox(int(key)))
-        return generator.standard_normal((*shape, 5), np.float32)
+        return pixel_normal((*shape, 5), self.seed, tag("noise/pixel"), self.view, k)
 
 
-def _tag(what: str, level: str) -> int:
-    return zlib.crc32(f"{what}/{level}".encode())
+class _FieldDraws(_Draws):
+    """The same with a field in space for every number that an object has (Eq. P.30)."""
 
+    def __init__(self, seed: int, view: int, samples: int, points: NDArray, length: float):
+        super().__init__(seed, view, samples, np.zeros(0))
+        self.fields = {level: Field(points, length, seed, tag(f"waves/{level}")) for level in self.keys}
 
-def _hash(*keys: int | NDArray) -> NDArray:
-    """Hash integers that broadcast to 64 bits, by the finaliser of splitmix64 applied to one key after another."""
-    h = np.uint64(0)
-    with np.errstate(over="ignore"):
-        for key in keys:
-            h = h ^ np.asarray(key, np.int64).astype(np.uint64)
-            h = h + np.uint64(0x9E3779B97F4A7C15)
-            h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-            h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-            h = h ^ (h >> np.uint64(31))
-    return h
+    def normal(self, what: str, level: str, channels: int = 1) -> NDArray:
+        drawn = self.fields[level](self.seed, tag(f"{what}/{level}/field"), np.arange(channels)[:, None], *self.keys[level])
+        return np.moveaxis(drawn, 0, 1)
 
+    def uniform(self, what: str, level: str, channels: int = 1) -> NDArray:
+        from scipy.special import ndtr
 
-def _unit_interval(h: NDArray) -> NDArray:
-    return ((h >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
-
-
-def _normal(uniform: NDArray) -> NDArray:
-    from scipy.special import ndtri
-
-    return ndtri(uniform)
+        return ndtr(self.normal(what, level, channels))

@@ -12,7 +12,7 @@ from tests.unit.test_priors import HEIGHT, WIDTH, Capture, view
 
 
 def test_simulated_spoils_the_truth():
-    prior = SimpleNamespace(samples=3, strength=1.0, shared=1.0)
+    prior = SimpleNamespace(samples=3, strength=1.0, shared=1.0, errors="objects", good_share=0.4, length=0.5)
     maps = simulated.predict(view(), SimpleNamespace(prior=prior), Capture(), 0)
     assert maps.shape == (3, HEIGHT, WIDTH, 5) and np.isfinite(maps).all()
     prior.strength = 0.0
