@@ -1,6 +1,7 @@
 """Objects from 2D masks: view consensus by hand, against loops, on known objects, and through the stage with files."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -426,6 +427,16 @@ def test_what_was_parted_or_joined_is_of_masks_as_what_it_was_elected_into():
     assert voted.tolist() == [True] and agreement[0] == pytest.approx((3 * 0.5 + 2 * 0.9 + 1) / 6)
 
 
+def test_faces_of_one_object_and_one_piece_are_parted_or_joined_as_one():
+    """Three views hold objects 0 and 1 in one mask, and the two pieces of object 2 in two."""
+    label, piece = np.array([0, 0, 1, 2, 2]), np.array([0, 0, 1, 0, 3])
+    face, mask = np.array([[0, 1, 2, 3, 4, -1]]), np.array([[1, 1, 1, 2, 3, 2]])
+    maps = SimpleNamespace(face=face, hit=face >= 0)
+    surface = SimpleNamespace(decoded=SimpleNamespace(maps=lambda view, photograph: maps))
+    united, parted, joined = masks._part_and_join(surface, [0, 1, 2], lambda view: mask, label, piece)
+    assert united.tolist() == [0, 0, 0, 2, 3] and (parted, joined) == (1, 1)
+
+
 @pytest.mark.long
 def test_spoilt_masks_make_pure_objects(photographed):
     root, _, things, capture = photographed
@@ -449,8 +460,6 @@ def test_spoilt_masks_make_pure_objects(photographed):
 
 
 def test_binary_masks_say_the_same_as_a_label_map(photographed, tmp_path):
-    from types import SimpleNamespace
-
     from workflow.segmentations.mask_files import mask_files
 
     _, path, _, capture = photographed
