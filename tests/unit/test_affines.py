@@ -12,6 +12,7 @@ from iif_core.fitting.levels import interpolate_levels
 from iif_core.fitting.pixels import evaluate, prepare_pixels
 from iif_core.fitting.problem import FitOptions, FitProblem, albedo_uncertainty
 from iif_core.fitting.selection import EVIDENCE_DISCOUNT, ROUGHNESS_GRID, Choice, Profile, choose_kinds
+from iif_core.fitting.tone import make_tone
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
 from iif_core.reflectance.material import GAINS, IDENTITY, MATTE_ROUGHNESS, apply_affines, unclamped_material
 from tests.errors import refused
@@ -28,6 +29,14 @@ EXACT = FitOptions(
     tolerance=1e-16,
 )
 PLAIN = {"select": False, "population": False}
+
+
+def test_curvature_of_a_power_is_its_closed_form():
+    """f = x^(1 / g): f'' / f'^2 = (1 - g) / f."""
+    y = np.linspace(0.3, 0.9, 7)[:, None] * [1.0, 0.9, 1.1]
+    exponents = np.array([[1.8], [2.2], [2.6]])
+    tone = make_tone(response("gamma", exponents), y)
+    np.testing.assert_allclose(tone.curvature_ratio(y), (1 - exponents.T) / y, rtol=5e-3)
 
 
 def test_planted_affines_are_recovered_from_clean_hdr():

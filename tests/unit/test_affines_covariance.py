@@ -21,6 +21,7 @@ from iif_core.fitting.descent import (
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.pixels import evaluate, prepare_pixels
 from iif_core.fitting.population import ProfiledRoughness, initial_population, population_prior, with_profiled_roughness
+from iif_core.fitting.population import _update_moments as update_moments
 from iif_core.fitting.problem import FitOptions
 from iif_core.fitting.selection import KINDS, ROUGHNESS_GRID, profile_roughness
 from iif_core.reflectance.material import IDENTITY
@@ -200,6 +201,18 @@ def test_objects_and_their_prior_follow_the_response():
     np.testing.assert_allclose(claimed[:, 12:14] @ level, shown[:, 12:14] @ level, rtol=0.1)
     without = -system.by_response[:, 12:14, 0] @ level
     assert (np.abs(without - shown[:, 12:14] @ level) > 0.3 * np.abs(shown[:, 12:14] @ level)).all()
+
+
+def test_the_level_of_roughness_is_learnt_from_objects_whose_contrast_is_fixed():
+    free = np.zeros((40, 16), bool)
+    free[:, 13] = True
+    theta = np.tile(IDENTITY, (40, 1))
+    theta[:, 12], theta[:, 13] = 0.2, 0.1
+    found = update_moments(initial_population(0.6), theta, np.zeros((40, 16, 16)), free, np.full(40, 0.5))
+    assert found.level == pytest.approx(0.2 * 0.5 + 0.1) and found.contrast == 0
+    free[:, 12:14] = True, False
+    found = update_moments(initial_population(0.6), theta, np.zeros((40, 16, 16)), free, np.full(40, 0.5))
+    assert found.contrast == pytest.approx(0.2) and found.level == 0.6
 
 
 def test_a_rough_metal_that_is_taken_for_a_dielectric_does_not_bend_the_response():
