@@ -39,6 +39,20 @@ def test_curvature_of_a_power_is_its_closed_form():
     np.testing.assert_allclose(tone.curvature_ratio(y), (1 - exponents.T) / y, rtol=5e-3)
 
 
+@pytest.mark.parametrize("objects", [[], [1, 3], [1, 2], [0, 1, 2, 3]])
+def test_chosen_objects_keep_their_pixels_and_clusters(objects):
+    problem, _ = problem_of(np.random.default_rng(0), 4, 60)
+    px, _ = prepare_pixels(replace(problem, cluster=np.arange(240) // 7), response("identity"))
+    some = px.only(np.array(objects, int))
+    np.testing.assert_array_equal(some.index, px.index[np.isin(px.obj, objects)])
+    assert some.starts[0] == 0 and some.starts[-1] == len(some.obj) == 60 * len(objects)
+
+    def sizes(pixels, o):
+        return np.diff(pixels.starts)[pixels.first[o] : pixels.first[o + 1]].tolist()
+
+    assert [sizes(some, i) for i in range(len(objects))] == [sizes(px, o) for o in objects]
+
+
 def test_planted_affines_are_recovered_from_clean_hdr():
     problem, truth = problem_of(np.random.default_rng(0))
     out = fit_affines(problem, response("identity"), EXACT)
