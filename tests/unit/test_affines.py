@@ -9,7 +9,7 @@ from iif_core.fitting.descent import GaussianPrior
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import Gauge, apply_gauge
 from iif_core.fitting.levels import interpolate_levels
-from iif_core.fitting.pixels import evaluate, prepare_pixels
+from iif_core.fitting.pixels import evaluate, prepare_pixels, run_in_threads
 from iif_core.fitting.problem import FitOptions, FitProblem, albedo_uncertainty
 from iif_core.fitting.selection import EVIDENCE_DISCOUNT, ROUGHNESS_GRID, Choice, Profile, choose_kinds
 from iif_core.fitting.tone import make_tone
@@ -51,6 +51,16 @@ def test_chosen_objects_keep_their_pixels_and_clusters(objects):
         return np.diff(pixels.starts)[pixels.first[o] : pixels.first[o + 1]].tolist()
 
     assert [sizes(some, i) for i in range(len(objects))] == [sizes(px, o) for o in objects]
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_threads_share_the_objects_by_their_pixels(threads):
+    px, _ = prepare_pixels(problem_of(np.random.default_rng(0), 8, 60)[0], response("identity"))
+    objects, found = np.array([0, 1, 3, 4, 6, 7]), []
+    run_in_threads(found.append, px, objects, threads)
+    found.sort(key=lambda part: part[0])
+    np.testing.assert_array_equal(np.concatenate(found), objects)
+    assert len(found) == threads and max(len(part) for part in found) <= len(objects) / threads + 1
 
 
 def test_planted_affines_are_recovered_from_clean_hdr():

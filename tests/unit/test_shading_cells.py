@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from iif_core.light.shading import roughness_levels
 from iif_core.surface import shading_cells
 from iif_core.surface.shading_cells import (
     REPRESENTATIVES,
@@ -29,6 +30,11 @@ def built(parts, edge=EDGE):
     for seed, part in enumerate(parts):
         builder.add(*part, seed)
     return builder.finish()
+
+
+def test_levels_of_roughness_reach_both_ends_and_are_closer_at_the_glossy_one():
+    levels = roughness_levels(5)
+    np.testing.assert_allclose(levels, 0.02 + 0.98 * np.array([0.0, 0.125, 0.3535534, 0.6495191, 1.0]), rtol=1e-6)
 
 
 def test_pixels_share_a_cell_by_place_object_and_direction():
