@@ -197,6 +197,17 @@ def test_predictions_of_small_photographs_are_enlarged_to_the_view(monkeypatch):
     np.testing.assert_allclose(found.maps[0, 1:], np.broadcast_to([0.2, 0.3, 0.4, 0.6, 0.1], (2, 4, 5)), rtol=1e-3)
 
 
+def test_objects_take_their_first_albedo_from_every_third_view(monkeypatch):
+    monkeypatch.setattr(correction, "features", lambda gathering, views, number: number)
+    made = object.__new__(correction.Correction)
+    made.views = CaptureViews(Room(), objects_given=True)
+    made.gathering = SimpleNamespace(group=np.array([-1, 0, 1]))
+    made._heads = lambda number: np.broadcast_to([*np.log([0.1 + 0.05 * number] * 3), *[0.0] * 5], (1, 3, 4, 8))
+    found, shown = made._albedo_of_objects(1), np.isin(made.gathering.group, made.views[0].object_id[1:])
+    np.testing.assert_allclose(found[shown], np.log([0.1, 0.25]).mean(), rtol=1e-5)
+    assert shown.any() and np.isnan(found[~shown]).all()
+
+
 def test_normals_face_the_viewer_and_faces_without_area_get_his_direction():
     normals = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]])
     towards = np.tile([0.0, 0.6, 0.8], (3, 1))

@@ -108,6 +108,45 @@ def test_votes_equal_loops_whatever_the_block(monkeypatch):
     np.testing.assert_array_equal(mc.cluster_masks(masks, options), clusters)
 
 
+def joined_by_loops(container, consensus):
+    """Eq. O.11 and O.12 with sets: the minima of observers fall, and each joins all pairs that agree at once."""
+    nodes = [({f for f, m in enumerate(row) if m >= 0}, {m for m in row if m >= 0}, {i}) for i, row in enumerate(container)]
+
+    def pairs():
+        for i, (views, held, _) in enumerate(nodes):
+            for j, (others, theirs, _) in enumerate(nodes[:i]):
+                if held & theirs and views & others:
+                    yield j, i, len(views & others), len(held & theirs)
+
+    found = np.floor(np.percentile([observers for *_, observers, _ in pairs()], mc.PERCENTILES)).astype(int)
+    for least in sorted({max(n, mc.MIN_OBSERVERS) for n in found.tolist()}, reverse=True):
+        owner = list(range(len(nodes)))
+        for i, j, observers, supporters in list(pairs()):
+            if observers >= least and supporters >= consensus * observers:
+                owner = [owner[i] if o == owner[j] else o for o in owner]
+        nodes = [
+            tuple(set().union(*(nodes[n][part] for n in range(len(nodes)) if owner[n] == o)) for part in range(3))
+            for o in dict.fromkeys(owner)
+        ]
+    label = np.empty(len(container), int)
+    for number, node in enumerate(sorted(nodes, key=lambda node: min(node[2]))):
+        label[list(node[2])] = number
+    return label
+
+
+def test_joining_of_masks_equals_loops():
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        things = np.repeat(np.arange(6), 20)
+        labels = [
+            1 + np.where(rng.random(120) < 0.3, rng.integers(0, 6, 120), things // rng.choice([1, 1, 2])) for _ in range(12)
+        ]
+        container = mc.containment(planted(labels, rng.random((12, 120)) < 0.5), mc.ConsensusOptions()).container
+        expected = joined_by_loops(container, 0.8)
+        assert 3 < expected.max() < len(container) - 9
+        np.testing.assert_array_equal(mc._join(container, len(container), 0.8), expected)
+
+
 def test_a_mask_that_views_split_is_dropped_and_its_opinion_with_it():
     a, b = np.repeat([1, 0], 20), np.repeat([0, 2], 20)
     labels = [a + b, a + b, a + b, np.ones(40, int)]  # the last view holds both together
