@@ -325,6 +325,11 @@ def test_scale_pins():
         fitted, wanted = (apply_affines(t, problem.object_id, problem.base)[:, :3].mean() for t in (found.affine, truth))
         assert fitted == pytest.approx(wanted, rel=0.03) and found.light_scale == pytest.approx(1.25, rel=0.02)
     assert apply_gauge(problem, free, Gauge("found")).affine is free.affine
+    gap = problem.base.copy()
+    gap[0, 1] = np.nan  # a pixel without a value in one channel does not count
+    without = replace(problem, object_id=np.where(np.arange(len(gap)) == 0, -1, problem.object_id))
+    spoilt, expected = (apply_gauge(p, free, Gauge("prior")).light_scale for p in (replace(problem, base=gap), without))
+    assert spoilt == pytest.approx(expected, rel=1e-12)
 
 
 def test_an_uncertain_level_is_averaged_with_the_prior():
