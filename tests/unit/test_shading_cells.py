@@ -39,6 +39,14 @@ def test_levels_of_roughness_reach_both_ends_and_are_closer_at_the_glossy_one():
     np.testing.assert_allclose(levels, 0.02 + 0.98 * np.array([0.0, 0.125, 0.3535534, 0.6495191, 1.0]), rtol=1e-6)
 
 
+def test_numbers_of_cells_are_spread_over_32_bits():
+    """They choose the random numbers of the cells: numbers that were close, or shared a bit, would share some of these."""
+    number = built([(*patch(4000, size=20.0), np.zeros(4000, int))]).number
+    assert len(np.unique(number)) == len(number) > 1000
+    bits = np.unpackbits(number[:, None].view(np.uint8), axis=1)
+    assert bits.shape[1] == 32 and (np.abs(bits.mean(0) - 0.5) < 4 * 0.5 / np.sqrt(len(number))).all()
+
+
 def test_pixels_share_a_cell_by_place_object_and_direction():
     points, normals = patch(400)
     ids = np.where(points[:, 0] < 1, 3, -1)
