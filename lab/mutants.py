@@ -4,7 +4,7 @@
     python -m lab.mutants --count 20 --only fusion/gauge   # of files whose path contains this text
 
 A mutant is the last commit with one operator, sign, constant or argument changed. It is killed if one of the unit tests closest
-to its file fails, or if they take four times as long as before. If it survives, it is equivalent, or a test is missing.
+to its file fails, or if they compute four times as long as before. If it survives, it is equivalent, or a test is missing.
 
 mutmut leaves out decorated functions, so every kernel of numba; cosmic-ray has one test command for all modules, and no samples.
 """
@@ -16,17 +16,19 @@ import ast
 import copy
 import csv
 import hashlib
+import math
 import os
 import random
 import re
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from dataclasses import astuple, dataclass
+from functools import partial
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -39,8 +41,9 @@ MODULES = (
 """Files whose lines are drawn. Kernels of light transport are left out: compiling a changed one takes minutes."""
 FEWEST_FILES, FARTHEST = 6, 3
 """Test files that are run for a file: all that import it, or this many that reach it by this many imports in a row."""
-SOON, PATIENCE = 60.0, 4.0
-"""Seconds, and times what the unchanged code takes, until a mutant counts as hung."""
+SOON, PATIENCE, IDLE = 60.0, 4.0, 30.0
+"""Seconds of a processor, and times what the unchanged code takes, until a mutant counts as hung; other work on the machine makes
+no difference. One that waits for something is ended after IDLE times these seconds."""
 GUARD = 1e-6
 """Constants below this only keep a division from 0 / 0."""
 
@@ -176,7 +179,7 @@ class Bench:
         self.root, self.tests, self.passed, self._clock = root, tests_by_file(root), set(), 1_000_000_000
 
     def verdict(self, mutant: Mutant) -> tuple[str, str, float]:
-        """Return `killed` or `survived`, by which test, and the seconds that took.
+        """Return `killed` or `survived`, by which test, and the seconds of a processor that took.
 
         Raises:
             SystemExit: the tests fail without any change.
@@ -203,7 +206,7 @@ class Bench:
         return "killed" if failed else "survived", failed, seconds
 
     def _run(self, path: Path, source: bytes, tests: tuple[str, ...], fresh: bool, limit: float | None) -> tuple[str, float]:
-        """What fails first with this source (empty: nothing), and the seconds that took.
+        """What fails first with this source (empty: nothing), and the seconds of a processor that took.
 
         Compiled callers in other files do not notice that a kernel changed, so with `fresh` nothing that was compiled is reused.
         """
@@ -211,12 +214,14 @@ class Bench:
         cache = self.root / ".numba" / (hashlib.sha256(source).hexdigest() if fresh else "shared")
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not long", "--tb=no", "-p", "no:cacheprovider", *tests]
         options = {"cwd": self.root, "env": {**os.environ, "NUMBA_CACHE_DIR": str(cache)}, "start_new_session": True}
-        begin = time.monotonic()
+        begin = _computed()
+        if limit is not None:
+            options["preexec_fn"] = partial(_confine, limit)
         with subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **options) as run:
             try:
-                said, _ = run.communicate(timeout=limit)
+                said, _ = run.communicate(timeout=limit and IDLE * limit)
             except subprocess.TimeoutExpired:
-                return _LATE, time.monotonic() - begin
+                said = _LATE
             finally:
                 if run.poll() is None:
                     os.killpg(run.pid, signal.SIGKILL)
@@ -224,12 +229,24 @@ class Bench:
                     shutil.rmtree(cache, ignore_errors=True)
         first = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", said, re.MULTILINE)
         failed = "" if run.returncode == 0 else first[1] if first else f"pytest ended with {run.returncode}"
-        return failed, time.monotonic() - begin
+        return _LATE if said == _LATE or run.returncode == -signal.SIGXCPU else failed, _computed() - begin
 
     def _write(self, path: Path, source: bytes) -> None:
         path.write_bytes(source)
         self._clock += 1  # Python takes byte code of the same second and size for current
         os.utime(path, (self._clock, self._clock))
+
+
+def _computed() -> float:
+    """Seconds of a processor that all trials took that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _confine(seconds: float) -> None:
+    """Limit the processor time of a trial; where memory is short, the trial is what the system ends first."""
+    resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(seconds), math.ceil(seconds) + 5))
+    Path("/proc/self/oom_score_adj").write_text("1000")
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -9,9 +9,10 @@ from iif_core.fitting.descent import GaussianPrior
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import Gauge, apply_gauge
 from iif_core.fitting.levels import interpolate_levels
-from iif_core.fitting.pixels import evaluate, prepare_pixels
+from iif_core.fitting.pixels import evaluate, prepare_pixels, run_in_threads
 from iif_core.fitting.problem import FitOptions, FitProblem, albedo_uncertainty
 from iif_core.fitting.selection import EVIDENCE_DISCOUNT, ROUGHNESS_GRID, Choice, Profile, choose_kinds
+from iif_core.fitting.tone import make_tone
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
 from iif_core.reflectance.material import GAINS, IDENTITY, MATTE_ROUGHNESS, apply_affines, unclamped_material
 from tests.errors import refused
@@ -28,6 +29,38 @@ EXACT = FitOptions(
     tolerance=1e-16,
 )
 PLAIN = {"select": False, "population": False}
+
+
+def test_curvature_of_a_power_is_its_closed_form():
+    """f = x^(1 / g): f'' / f'^2 = (1 - g) / f."""
+    y = np.linspace(0.3, 0.9, 7)[:, None] * [1.0, 0.9, 1.1]
+    exponents = np.array([[1.8], [2.2], [2.6]])
+    tone = make_tone(response("gamma", exponents), y)
+    np.testing.assert_allclose(tone.curvature_ratio(y), (1 - exponents.T) / y, rtol=5e-3)
+
+
+@pytest.mark.parametrize("objects", [[], [1, 3], [1, 2], [0, 1, 2, 3]])
+def test_chosen_objects_keep_their_pixels_and_clusters(objects):
+    problem, _ = problem_of(np.random.default_rng(0), 4, 60)
+    px, _ = prepare_pixels(replace(problem, cluster=np.arange(240) // 7), response("identity"))
+    some = px.only(np.array(objects, int))
+    np.testing.assert_array_equal(some.index, px.index[np.isin(px.obj, objects)])
+    assert some.starts[0] == 0 and some.starts[-1] == len(some.obj) == 60 * len(objects)
+
+    def sizes(pixels, o):
+        return np.diff(pixels.starts)[pixels.first[o] : pixels.first[o + 1]].tolist()
+
+    assert [sizes(some, i) for i in range(len(objects))] == [sizes(px, o) for o in objects]
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_threads_share_the_objects_by_their_pixels(threads):
+    px, _ = prepare_pixels(problem_of(np.random.default_rng(0), 8, 60)[0], response("identity"))
+    objects, found = np.array([0, 1, 3, 4, 6, 7]), []
+    run_in_threads(found.append, px, objects, threads)
+    found.sort(key=lambda part: part[0])
+    np.testing.assert_array_equal(np.concatenate(found), objects)
+    assert len(found) == threads and max(len(part) for part in found) <= len(objects) / threads + 1
 
 
 def test_planted_affines_are_recovered_from_clean_hdr():
@@ -292,6 +325,11 @@ def test_scale_pins():
         fitted, wanted = (apply_affines(t, problem.object_id, problem.base)[:, :3].mean() for t in (found.affine, truth))
         assert fitted == pytest.approx(wanted, rel=0.03) and found.light_scale == pytest.approx(1.25, rel=0.02)
     assert apply_gauge(problem, free, Gauge("found")).affine is free.affine
+    gap = problem.base.copy()
+    gap[0, 1] = np.nan  # a pixel without a value in one channel does not count
+    without = replace(problem, object_id=np.where(np.arange(len(gap)) == 0, -1, problem.object_id))
+    spoilt, expected = (apply_gauge(p, free, Gauge("prior")).light_scale for p in (replace(problem, base=gap), without))
+    assert spoilt == pytest.approx(expected, rel=1e-12)
 
 
 def test_an_uncertain_level_is_averaged_with_the_prior():

@@ -21,6 +21,7 @@ from iif_core.fitting.descent import (
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.pixels import evaluate, prepare_pixels
 from iif_core.fitting.population import ProfiledRoughness, initial_population, population_prior, with_profiled_roughness
+from iif_core.fitting.population import _update_moments as update_moments
 from iif_core.fitting.problem import FitOptions
 from iif_core.fitting.selection import KINDS, ROUGHNESS_GRID, profile_roughness
 from iif_core.reflectance.material import IDENTITY
@@ -200,6 +201,38 @@ def test_objects_and_their_prior_follow_the_response():
     np.testing.assert_allclose(claimed[:, 12:14] @ level, shown[:, 12:14] @ level, rtol=0.1)
     without = -system.by_response[:, 12:14, 0] @ level
     assert (np.abs(without - shown[:, 12:14] @ level) > 0.3 * np.abs(shown[:, 12:14] @ level)).all()
+
+
+def test_the_prior_of_roughness_is_on_its_level_and_its_contrast():
+    """The level is g r + h, so its precision enters along (r, 1); that of the contrast enters for g alone."""
+    base, noise, discount = np.array([0.3, 0.7]), np.array([1.0, 2.0]), 4.0
+    size, contrast = discount * noise, 1 / initial_population().spread[4] ** 2
+
+    def block(level, other):
+        return np.array([[[k * r * r + o, k * r], [k * r, k]] for k, o, r in zip(level, other, base, strict=True)])
+
+    prior = population_prior(initial_population(0.6, 0.2), noise, base, np.tile(KINDS[0], (2, 1)), discount)
+    np.testing.assert_allclose(prior.weight[:, 12:14, 12:14], block(size / 0.2**2, size * contrast))
+    np.testing.assert_allclose(prior.scatter[:, 12:14, 12:14], block(size**2 / 0.2**2, size**2 * contrast))
+    of_objects = (np.array(values) for values in ([0.4, 0.5], [0.1, 0.2], [0.05, 0.03], [0.02, 0.01]))
+    found = with_profiled_roughness(prior, ProfiledRoughness(*of_objects, None, np.zeros((2, 1))), noise, base, 0.2, discount)
+    strength = size / np.array([0.1, 0.2]) ** 2
+    both = strength**2 * np.array([0.05, 0.03]) ** 2 + 2 * strength * np.array([0.02, 0.01])
+    np.testing.assert_allclose(found.weight[:, 12:14, 12:14], block(strength, size * contrast))
+    np.testing.assert_allclose(found.scatter[:, 12:14, 12:14], block(both, size**2 * contrast))
+    np.testing.assert_allclose(found.centre[:, 13], [0.4 - 0.2 * 0.3, 0.5 - 0.2 * 0.7])
+
+
+def test_the_level_of_roughness_is_learnt_from_objects_whose_contrast_is_fixed():
+    free = np.zeros((40, 16), bool)
+    free[:, 13] = True
+    theta = np.tile(IDENTITY, (40, 1))
+    theta[:, 12], theta[:, 13] = 0.2, 0.1
+    found = update_moments(initial_population(0.6), theta, np.zeros((40, 16, 16)), free, np.full(40, 0.5))
+    assert found.level == pytest.approx(0.2 * 0.5 + 0.1) and found.contrast == 0
+    free[:, 12:14] = True, False
+    found = update_moments(initial_population(0.6), theta, np.zeros((40, 16, 16)), free, np.full(40, 0.5))
+    assert found.contrast == pytest.approx(0.2) and found.level == 0.6
 
 
 def test_a_rough_metal_that_is_taken_for_a_dielectric_does_not_bend_the_response():

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 from iif_core.camera.pixels import ViewMaps
+from iif_core.camera.response import response
 from iif_core.camera.view import View
 from iif_core.surface.triangles import towards_viewer
 from workflow.artifacts.store import ids_to_disk
+from workflow.priors import correction
+from workflow.priors import views as of_priors
 from workflow.priors.views import CaptureViews
 from workflow.scene.decoded import DecodedViews, Kept
 from workflow.segmentations.geometry import mean_face_colour
@@ -164,6 +167,45 @@ def test_a_prior_of_all_photographs_decodes_each_once(factor):
         for view in files.used:
             assert views.of(view).hit.any() and views.full(view).valid.sum() == 8
     assert set(files.reads.values()) == {1} and len(files.reads) == 8
+
+
+def test_photographs_become_linear_by_the_response_that_was_found_unless_they_are_radiance(monkeypatch):
+    found = SimpleNamespace(response=response("gamma", [2.0]), exposure=[1.0, 2.0, 3.0, 4.0], rows=1, reason="")
+    monkeypatch.setattr(of_priors, "calibrate_response", lambda *_: found)
+    files = Room()
+    views = CaptureViews(files, objects_given=True)
+    views.calibrate()
+    for number, view in enumerate(files.used):
+        made = views.of(view)
+        np.testing.assert_allclose(made.value[1:], (0.1 + 0.2 * number) ** 2, rtol=1e-4)
+        assert made.camera.exposure == number + 1
+    files.is_hdr = True
+    views = CaptureViews(files, objects_given=True)
+    views.calibrate()
+    assert views.response is None and np.allclose(views.of(files.used[3]).value[1:], 0.7)
+
+
+def test_predictions_of_small_photographs_are_enlarged_to_the_view(monkeypatch):
+    files = Room()
+    monkeypatch.setattr(correction, "features", lambda *_: None)
+    made = object.__new__(correction.Correction)
+    made.views, made.factor, made.samples = CaptureViews(files, objects_given=True, factor=2), 2, 1
+    made.gathering, made.recipe = None, {"scale_calibration": (1.0, 1.0, 1.0)}
+    made._heads = lambda _: np.broadcast_to([*np.log([0.2, 0.3, 0.4]), 0.6, 0.1, -1.0, -1.0, -1.0], (1, 2, 2, 8))
+    found = made(files.used[1])
+    assert found.scale.shape == (3, 4, 3)
+    np.testing.assert_allclose(found.maps[0, 1:], np.broadcast_to([0.2, 0.3, 0.4, 0.6, 0.1], (2, 4, 5)), rtol=1e-3)
+
+
+def test_objects_take_their_first_albedo_from_every_third_view(monkeypatch):
+    monkeypatch.setattr(correction, "features", lambda gathering, views, number: number)
+    made = object.__new__(correction.Correction)
+    made.views = CaptureViews(Room(), objects_given=True)
+    made.gathering = SimpleNamespace(group=np.array([-1, 0, 1]))
+    made._heads = lambda number: np.broadcast_to([*np.log([0.1 + 0.05 * number] * 3), *[0.0] * 5], (1, 3, 4, 8))
+    found, shown = made._albedo_of_objects(1), np.isin(made.gathering.group, made.views[0].object_id[1:])
+    np.testing.assert_allclose(found[shown], np.log([0.1, 0.25]).mean(), rtol=1e-5)
+    assert shown.any() and np.isnan(found[~shown]).all()
 
 
 def test_normals_face_the_viewer_and_faces_without_area_get_his_direction():

@@ -150,6 +150,15 @@ def test_directions_beyond_the_turning_point_are_not_seen():
     assert not seen[r > 1].any() and seen[r < 0.6].all()
 
 
+@pytest.mark.parametrize("tilt", [(0.02, 0.0), (0.0, 0.02)])
+def test_a_lens_that_is_tilted_about_one_axis_alone_is_undone(tilt):
+    lens = Distortion("radial_tangential", (-0.1, 0, 0, 0), tilt)
+    points = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.4, 0.4, 5)), -1)
+    straight, inside = undistort(lens, points)
+    assert inside.all()
+    np.testing.assert_allclose(distort(lens, straight)[0], points, atol=1e-9)
+
+
 def test_one_pixel_and_bad_coefficients():
     one = Pinhole(1.0, 1.0, 0.5, 0.5, 1, 1)
     got, seen = undistort_image(np.full((1, 1, 3), 0.25, np.float32), Distortion("radial_tangential"), one, one)

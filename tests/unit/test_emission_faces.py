@@ -244,6 +244,8 @@ def test_a_curtain_is_one_lamp_however_its_folds_fall():
     out = group_emitters(candidate, stats, adjacency, normals, areas, glowing=glowing)
     assert np.ptp(out.of_face[object_id == 0]) == 0 and out.size == 2
     assert (glowing_pieces(_statistics([3] + [0] * 39, 9 * np.ones(40)), adjacency, object_id, steady) == -1).all()
+    unseen = _statistics([0] * 40, 9 * np.ones(40))
+    assert (glowing_pieces(unseen, adjacency, object_id, steady) == -1).all()
     mirror = face, views, np.repeat(brightness, 6) * np.where(views % 2 == 0, 0.1, 1.9)  # a window in every other view
     assert (glowing_pieces(stats, adjacency, object_id, mirror) == -1).all()
 

@@ -86,6 +86,15 @@ def test_column_of_zeros_stays_at_the_initial_value():
     assert out.determined.tolist()[1] == 0 and (out.error[1] == 3.3).all()
 
 
+def test_the_prior_of_a_dark_group_is_as_wide_as_that_of_a_tenth_of_the_brightest():
+    """An unseen group follows a seen one by correlation times the ratio of their widths, here 0.1."""
+    a = np.zeros((50, 2, 3), np.float32)
+    a[:, 0] = 1
+    prior = EmissionPrior(np.repeat([[10.0], [0.0]], 3, 1), np.full(2, 1.5), np.array([[1.0, 0.5], [0.5, 1.0]]))
+    out = prior.solve(_rows(a, a, np.full((50, 3), 14.0)))
+    np.testing.assert_allclose(out.radiance, np.repeat([[14.0], [0.5 * 0.1 * (14 - 10)]], 3, 1), rtol=1e-3)
+
+
 def test_duplicate_columns_share_evenly():
     a, _ = _random()
     a[:, 1] = a[:, 0]

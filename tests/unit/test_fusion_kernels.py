@@ -7,6 +7,8 @@ from hypothesis import strategies as st
 
 from iif_core.fusion import kernels
 from iif_core.fusion.problem import LOWEST
+from iif_core.fusion.sums import SegmentSums
+from iif_core.reflectance.material import IDENTITY
 from lab.published.fusion.divergence import reference_scale
 from lab.published.fusion.sgd.pool import as_floats
 
@@ -25,6 +27,19 @@ def pixels(seed=0, k=3, counts=(1, 700, 0, 256, 257), half=False):
 
 def by_segment(start, array):
     return np.stack([array[..., a:b].sum(-1) for a, b in zip(start[:-1], start[1:], strict=True)])
+
+
+def test_errors_of_maps_are_mean_squares_and_never_negative():
+    """The texture is prediction 0, whose error is a difference of equal sums."""
+    words, _, weight, start, v = pixels(counts=(90,) * 60)
+    target, sums = v[0].astype(np.float32), SegmentSums(60, 3, np.ones(1))
+    sums.gram[:] = kernels.gram(words, weight, start, NONE)
+    sums.weight[:] = sums.gram[:, 0, 13]
+    products = kernels.cross(words, target, weight, start, NONE), kernels.square(target, weight, start)
+    found = sums.errors(np.arange(60), np.tile(IDENTITY, (60, 3, 1)), *products)
+    each = by_segment(start, weight * (v - v[0]) ** 2) / sums.weight[:, None, None]
+    np.testing.assert_allclose(found, np.stack([each[..., :3].mean(-1), each[..., 3], each[..., 4]], -1), atol=1e-6)
+    assert found.min() == 0
 
 
 @pytest.mark.parametrize("half", [False, True])

@@ -147,6 +147,15 @@ def test_neighbours_are_the_views_that_see_the_same_surface(room, monkeypatch):
     assert [int(own[0]) for own in gathered.neighbours] == [0, 1, 2, 3]
 
 
+def test_blocks_of_surface_are_counted_from_its_lowest_corner(room):
+    cells, _, seen = inputs._cells(room)
+    points = [view.points()[view.hit] for view in room]
+    low = np.concatenate(points).min(0)
+    for found, own in zip(seen, points, strict=True):
+        i, j, k = np.unique((own - low) // (4 * cells.edge), axis=0).astype(int).T
+        np.testing.assert_array_equal(found, i * 2**42 + j * 2**21 + k)
+
+
 def test_a_first_prediction_moves_the_light_and_nothing_else(room):
     """With the true albedos the quotients of the walls differ as the albedos do."""
     gathering = gather_views(room, trace_box)

@@ -8,6 +8,7 @@ import pytest
 
 from iif_core.light.emission import photographs
 from iif_core.light.emission.cache import RadianceVoxels
+from iif_core.light.emission.emitters import METAL
 from iif_core.light.emission.find import find_light, look_around
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.photographs import (
@@ -19,7 +20,7 @@ from iif_core.light.emission.photographs import (
 )
 from iif_core.light.emission.response import calibrated
 from iif_core.light.emission.see_through import seen_through, translucent_objects
-from iif_core.light.emission.sun_search import find_sun
+from iif_core.light.emission.sun_search import _Rows, find_sun
 from iif_core.light.environment import solid_angles
 from tests.unit.photographed_room import neighbours, of_views, photographed
 from tests.workflow.light_room import BULB, LAMP, SIZE, Room, _quad
@@ -173,6 +174,23 @@ def test_no_place_for_a_sun_traces_nothing(closed):
     known = sky.groups()
     same, evidence = find_sun(replace(closed[0], tracer=NoTracer()), known, 1.0)
     assert same is known and evidence is None and solid_angles(*known.columns.shape).sum() == pytest.approx(4 * np.pi)
+
+
+def test_what_points_reflect_of_a_white_sky_is_their_albedo():
+    """Twice with rays of its own; nothing of the half that a wall hides, and nothing of what is surely a metal."""
+    normals, base = np.tile([0.0, 0.0, 1.0], (4, 1)), np.tile([0.2, 0.4, 0.8, 0.5, 0.0], (4, 1))
+    base[:, 4] = 0.0, 0.0, METAL, 1.0
+
+    def meets(origins, directions):
+        return np.where((origins[:, 0] > 0) & (directions[:, 0] > 0), 0, -1), None
+
+    log = SimpleNamespace(progress=lambda *_: None)
+    photos = SimpleNamespace(options=SimpleNamespace(seed=0), tracer=SimpleNamespace(meets=meets), log=log)
+    pixels = SimpleNamespace(points=np.eye(4, 3, k=-1), normals=normals, base=base)
+    found = _Rows(photos, None, pixels, None, None)._direct(np.arange(16 * 32), (16, 32)).sum(2)
+    share = np.array([1.0, 0.5, 1.0, 0.0])
+    np.testing.assert_allclose(found, np.broadcast_to(share[:, None] * base[:, :3], (2, 4, 3)), rtol=0.05)
+    assert not np.array_equal(*found)
 
 
 def test_linear_photographs_have_no_response(closed):

@@ -1,6 +1,7 @@
 """Objects from 2D masks: view consensus by hand, against loops, on known objects, and through the stage with files."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -105,6 +106,45 @@ def test_votes_equal_loops_whatever_the_block(monkeypatch):
     monkeypatch.setattr(mc, "BLOCK_MASKS", 7)
     np.testing.assert_array_equal(mc.containment(masks, options).container, container)
     np.testing.assert_array_equal(mc.cluster_masks(masks, options), clusters)
+
+
+def joined_by_loops(container, consensus):
+    """Eq. O.11 and O.12 with sets: the minima of observers fall, and each joins all pairs that agree at once."""
+    nodes = [({f for f, m in enumerate(row) if m >= 0}, {m for m in row if m >= 0}, {i}) for i, row in enumerate(container)]
+
+    def pairs():
+        for i, (views, held, _) in enumerate(nodes):
+            for j, (others, theirs, _) in enumerate(nodes[:i]):
+                if held & theirs and views & others:
+                    yield j, i, len(views & others), len(held & theirs)
+
+    found = np.floor(np.percentile([observers for *_, observers, _ in pairs()], mc.PERCENTILES)).astype(int)
+    for least in sorted({max(n, mc.MIN_OBSERVERS) for n in found.tolist()}, reverse=True):
+        owner = list(range(len(nodes)))
+        for i, j, observers, supporters in list(pairs()):
+            if observers >= least and supporters >= consensus * observers:
+                owner = [owner[i] if o == owner[j] else o for o in owner]
+        nodes = [
+            tuple(set().union(*(nodes[n][part] for n in range(len(nodes)) if owner[n] == o)) for part in range(3))
+            for o in dict.fromkeys(owner)
+        ]
+    label = np.empty(len(container), int)
+    for number, node in enumerate(sorted(nodes, key=lambda node: min(node[2]))):
+        label[list(node[2])] = number
+    return label
+
+
+def test_joining_of_masks_equals_loops():
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        things = np.repeat(np.arange(6), 20)
+        labels = [
+            1 + np.where(rng.random(120) < 0.3, rng.integers(0, 6, 120), things // rng.choice([1, 1, 2])) for _ in range(12)
+        ]
+        container = mc.containment(planted(labels, rng.random((12, 120)) < 0.5), mc.ConsensusOptions()).container
+        expected = joined_by_loops(container, 0.8)
+        assert 3 < expected.max() < len(container) - 9
+        np.testing.assert_array_equal(mc._join(container, len(container), 0.8), expected)
 
 
 def test_a_mask_that_views_split_is_dropped_and_its_opinion_with_it():
@@ -426,6 +466,16 @@ def test_what_was_parted_or_joined_is_of_masks_as_what_it_was_elected_into():
     assert voted.tolist() == [True] and agreement[0] == pytest.approx((3 * 0.5 + 2 * 0.9 + 1) / 6)
 
 
+def test_faces_of_one_object_and_one_piece_are_parted_or_joined_as_one():
+    """Three views hold objects 0 and 1 in one mask, and the two pieces of object 2 in two."""
+    label, piece = np.array([0, 0, 1, 2, 2]), np.array([0, 0, 1, 0, 3])
+    face, mask = np.array([[0, 1, 2, 3, 4, -1]]), np.array([[1, 1, 1, 2, 3, 2]])
+    maps = SimpleNamespace(face=face, hit=face >= 0)
+    surface = SimpleNamespace(decoded=SimpleNamespace(maps=lambda view, photograph: maps))
+    united, parted, joined = masks._part_and_join(surface, [0, 1, 2], lambda view: mask, label, piece)
+    assert united.tolist() == [0, 0, 0, 2, 3] and (parted, joined) == (1, 1)
+
+
 @pytest.mark.long
 def test_spoilt_masks_make_pure_objects(photographed):
     root, _, things, capture = photographed
@@ -449,8 +499,6 @@ def test_spoilt_masks_make_pure_objects(photographed):
 
 
 def test_binary_masks_say_the_same_as_a_label_map(photographed, tmp_path):
-    from types import SimpleNamespace
-
     from workflow.segmentations.mask_files import mask_files
 
     _, path, _, capture = photographed

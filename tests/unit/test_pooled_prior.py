@@ -10,7 +10,7 @@ import pytest
 from iif_core.errors import InputError
 from tests.errors import refused
 from workflow.costs.work import SceneSize, work_of
-from workflow.priors import Predicted, files, learned, pooled, retinex
+from workflow.priors import Predicted, correction, files, learned, pooled, retinex
 from workflow.runtime import fingerprint as fp
 from workflow.settings import dump, load
 from workflow.settings.prior import predictions
@@ -89,6 +89,12 @@ def test_threads_may_share_a_pool_only_where_they_may_share_all_members(fakes, m
     for module in (retinex, learned):
         monkeypatch.setattr(module, "prepare", lambda *args: shared)
     assert pooled.prepare(settings(), None, 0, lambda array: array).concurrent
+
+
+def test_the_learned_prior_hands_on_what_it_is_given(monkeypatch):
+    monkeypatch.setattr(correction, "Correction", lambda *given: given)
+    given = ("settings", "capture", 7, "keep", 2, "light")
+    assert learned.prepare(*given) == given
 
 
 def test_the_facts_are_those_of_each_member_and_state_the_errors_of_the_learned_one():

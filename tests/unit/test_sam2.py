@@ -152,6 +152,13 @@ def test_answers_that_are_not_finite_and_views_without_masks(made, monkeypatch):
     assert not labels.any() and count == 0 and "no mask passed" in wrong
 
 
+def test_only_what_is_more_confident_than_the_limit_is_a_mask(made):
+    scores = generator(made, confidence=0.0, stability=0.0).proposals(picture())[1]
+    limit = float(np.sort(scores)[len(scores) // 2])
+    found = generator(made, confidence=limit, stability=0.0).proposals(picture())[1]
+    np.testing.assert_array_equal(found, scores[scores > limit])
+
+
 # --------------------------------------------------------------------------------------------------------------- the stage
 
 

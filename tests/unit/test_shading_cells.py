@@ -1,8 +1,11 @@
 """Diffuse light per surface cell: which pixels share a cell, number of paths, and agreement with the light of the pixels."""
 
+import warnings
+
 import numpy as np
 import pytest
 
+from iif_core.light.shading import roughness_levels
 from iif_core.surface import shading_cells
 from iif_core.surface.shading_cells import (
     REPRESENTATIVES,
@@ -29,6 +32,19 @@ def built(parts, edge=EDGE):
     for seed, part in enumerate(parts):
         builder.add(*part, seed)
     return builder.finish()
+
+
+def test_levels_of_roughness_reach_both_ends_and_are_closer_at_the_glossy_one():
+    levels = roughness_levels(5)
+    np.testing.assert_allclose(levels, 0.02 + 0.98 * np.array([0.0, 0.125, 0.3535534, 0.6495191, 1.0]), rtol=1e-6)
+
+
+def test_numbers_of_cells_are_spread_over_32_bits():
+    """They choose the random numbers of the cells: numbers that were close, or shared a bit, would share some of these."""
+    number = built([(*patch(4000, size=20.0), np.zeros(4000, int))]).number
+    assert len(np.unique(number)) == len(number) > 1000
+    bits = np.unpackbits(number[:, None].view(np.uint8), axis=1)
+    assert bits.shape[1] == 32 and (np.abs(bits.mean(0) - 0.5) < 4 * 0.5 / np.sqrt(len(number))).all()
 
 
 def test_pixels_share_a_cell_by_place_object_and_direction():
@@ -144,7 +160,8 @@ def test_two_estimates_are_better_than_one():
     assert scatter == pytest.approx(1 / np.sqrt(1 / 0.1**2 + 1 / 0.2**2), rel=0.05)
     assert abs(np.corrcoef((both / truth - 1)[..., 0])[0, 1]) < 0.07
     assert not combine_estimates(np.zeros((2, 5, 3)), 0.0, np.zeros((2, 5, 3))).any()
-    assert combine_estimates(np.zeros((2, 0, 3)), 0.1, np.zeros((2, 0, 3))).shape == (2, 0, 3)
+    with warnings.catch_warnings(action="error"):  # no pixel: no median of nothing
+        assert combine_estimates(np.zeros((2, 0, 3)), 0.1, np.zeros((2, 0, 3))).shape == (2, 0, 3)
 
 
 def test_normals_of_every_direction_have_a_bin():
