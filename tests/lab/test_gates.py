@@ -5,10 +5,10 @@ import json
 import pytest
 from gates import PATH, ROOMS, SCORES, SEEDS, run, take
 
-DECIBELS = 0.3
-"""By how much a score of one run may fall. Machines differ by less."""
-MEAN = 0.1
-"""The same of the mean over all rooms and seeds."""
+DECIBELS = 1.0
+"""By how much a score of one run may fall: other machines round rays otherwise, and a lamp more or less moves a room by as much."""
+MEAN_OF_ROOMS, MEAN = 0.5, 0.1
+"""The same of the mean over the rooms, and over rooms and seeds."""
 HELD = 0.9
 """Least share of the channels of all objects that 95 % intervals hold. There are a few hundred, three an object."""
 
@@ -19,6 +19,8 @@ def test_one_run_of_each_room(tmp_path_factory):
     assert done.returncode == 0, done.stderr[-4000:]
     expected, found = json.loads(PATH.read_text()), take(folder, seeds=SEEDS[:1])
     assert fallen(found["scores"], expected["scores"], DECIBELS) == {}
+    same = {name: expected["scores"][name] for name in found["scores"]}
+    assert fallen({"mean": mean(found["scores"])}, {"mean": mean(same)}, MEAN_OF_ROOMS) == {}
     assert found["held"] >= HELD, found["held"]
 
 
@@ -28,12 +30,12 @@ def test_means_of_three_seeds(tmp_path_factory):
     done = run(folder)
     assert done.returncode == 0, done.stderr[-4000:]
     expected, found = json.loads(PATH.read_text()), take(folder)
-    assert fallen({"mean": mean(found)}, {"mean": mean(expected)}, MEAN) == {}
+    assert fallen({"mean": mean(found["scores"])}, {"mean": mean(expected["scores"])}, MEAN) == {}
     assert found["held"] >= HELD, found["held"]
 
 
-def mean(gates):
-    return {name: sum(scores[name] for scores in gates["scores"].values()) / len(gates["scores"]) for name in SCORES}
+def mean(scores):
+    return {name: sum(run[name] for run in scores.values()) / len(scores) for name in SCORES}
 
 
 def fallen(found, expected, decibels):
@@ -45,6 +47,6 @@ def fallen(found, expected, decibels):
 def test_the_gates_are_complete_and_close():
     expected = json.loads(PATH.read_text())
     assert set(expected["scores"]) == {f"{room}-{seed}" for room in ROOMS for seed in SEEDS}
-    worse = {run: {name: value - 0.4 for name, value in scores.items()} for run, scores in expected["scores"].items()}
+    worse = {run: {name: value - 1.1 for name, value in scores.items()} for run, scores in expected["scores"].items()}
     assert len(fallen(worse, expected["scores"], DECIBELS)) == len(SCORES) * len(worse)
     assert fallen(expected["scores"], expected["scores"], MEAN) == {} and expected["held"] >= HELD
