@@ -197,6 +197,7 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     none = {name: np.zeros(0, np.float32) for name in ("gain_r", "gain_g", "gain_b", "transmittance")}
     writer.table("object_gains.parquet", {"object_id": np.zeros(0, np.int32), **none})
     writer.table("emitter_faces.parquet", {"face_id": np.array([24, 25]), "emitter_id": [0, 0], "side": [1, 1]})
+    writer.table("radiance_cache.parquet", {f"radiance_{c}": np.full(5, 0.05, np.float32) for c in "rgb"})
     exposure = [view.exposure for view, *_ in seen]
     gains = {"exposure": exposure, "gain": [[e] * 3 for e in exposure], "vignetting": [0.0, 0.0]}
     escape = {"primary": 0.0, "secondary": 0.0}

@@ -91,8 +91,8 @@ class Meaning(NamedTuple):
 
 MEANS: dict[str, Meaning] = {
     "geometry": Meaning(
-        {"offset": 0.04, "missing": 0.1},
-        "three of four photographs lie on the mesh to within 4 % of their width, and that it lacks at most 10 % of the room's"
+        {"offset": 0.05, "missing": 0.1},
+        "three of four photographs lie on the mesh to within 5 % of their width, and that it lacks at most 10 % of the room's"
         " surface",
     ),
     "light": Meaning({"false_m2": 0.5}, "at most 0.5 m² of surface is taken for a lamp and is none"),
