@@ -6,7 +6,7 @@ import pytest
 from gates import PATH, ROOMS, SCORES, SEEDS, run, take
 
 DECIBELS = 1.0
-"""By how much a score of one run may fall: other machines round rays otherwise, and a lamp more or less moves a room by as much."""
+"""By how much a score of one run may fall: other machines round rays otherwise, and a lamp more moves a room by as much."""
 MEAN_OF_ROOMS, MEAN = 0.5, 0.1
 """The same of the mean over the rooms, and over rooms and seeds."""
 HELD = 0.9
