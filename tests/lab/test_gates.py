@@ -3,7 +3,8 @@
 import json
 
 import pytest
-from gates import PATH, ROOMS, SCORES, SEEDS, run, take
+
+from tests.lab.gates import PATH, ROOMS, SCORES, SEEDS, run, take
 
 DECIBELS = 1.0
 """By how much a score of one run may fall: other machines round rays otherwise, and a lamp more moves a room by as much."""
