@@ -62,7 +62,7 @@ def test_numbers_at_the_head_name_what_would_be_good():
     means = {"result": {"rgb": {"raw": PSNR}, "albedo": {"raw": {"shading_left": {"mean": 0.123}}}}}
     found = {number.explained: number for number in scores.head_numbers(means)}
     assert list(found) == ["rgb-raw-psnr", "albedo-raw-shading-left"]
-    assert found["rgb-raw-psnr"].value == "25.0 dB" and found["rgb-raw-psnr"].good == "good from 22 dB"
+    assert found["rgb-raw-psnr"].value == "25.0 dB" and found["rgb-raw-psnr"].good == "good from 20 dB"
     assert found["albedo-raw-shading-left"].good == "0 is none"
     assert {key for key, *_ in scores.explanations(means)} == set(found)
 
