@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from iif_core.light.emission import photographs
+from iif_core.light.emission import emitters, photographs
 from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.emitters import METAL
 from iif_core.light.emission.find import find_light, look_around
@@ -164,6 +164,31 @@ def test_lamps_are_in_no_voxel_of_the_cache(closed):
     none = EmitterGroups.none(len(photos.scene.faces))
     whole, rest = (radiance_cache(photos, groups) for groups in (none, look_around(photos, neighbours(photos)).groups))
     assert isinstance(rest, RadianceVoxels) and rest.radiance.max() < 0.5 * LAMP < whole.radiance.max()
+
+
+def test_bounds_are_raised_to_what_surface_reflects_and_at_most_to_the_light(closed, monkeypatch):
+    """Albedos are `gain` times the base, or 1: what is shown is `gain` times the traced light, or the light over the base."""
+    photos, _ = closed
+    groups = look_around(photos, neighbours(photos)).groups
+    cache = radiance_cache(photos, groups)
+    cache = replace(cache, censored=np.ones(len(cache.radiance), bool))
+    traced = []
+
+    def trace_rows(photos, pixels, *_):
+        traced.append(1.0 / pixels.base[:, :3])
+        n = len(pixels.base)
+        return SimpleNamespace(matrix=np.full((2, 1, n, groups.size, 3), 100.0), cached=np.full((2, 1, n, 3), 200.0))
+
+    monkeypatch.setattr(emitters, "trace_rows", trace_rows)
+    light = 100.0 * 3 * groups.size + 200.0
+    for gain in (0.5, 1e9):
+        gains = SimpleNamespace(gain=np.full((len(photos.names), 3), gain))
+        found = SimpleNamespace(groups=groups, cache=cache, gains=gains)
+        shown = emitters._raised(photos, None, found, cache, np.full((groups.size, 3), 3.0), None).radiance
+        expected = np.minimum(gain, traced[-1]) * light
+        changed = (shown != cache.radiance).any(1)
+        assert changed.sum() > 20 and shown[changed].min() >= expected.min() * 0.999
+        assert shown.max() == pytest.approx(expected.max(), rel=1e-5)
 
 
 def test_no_place_for_a_sun_traces_nothing(closed):
