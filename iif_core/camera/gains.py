@@ -148,6 +148,7 @@ def estimate(rows: GainRows, n_views: int, white_balance: bool = True, vignettin
     # Views without rows have empty columns and stay at gain 1.
     known = np.asarray(np.abs(design).sum(0)).ravel() > 0
     if white_balance:
+        chroma = np.kron(np.eye(n_views), np.eye(3) - 1 / 3)  # of log gains, relative to their views
         of_channels = known[: 3 * n_views].reshape(n_views, 3)
         of_channels |= of_channels.any(1, keepdims=True)
     known = np.flatnonzero(known)
@@ -166,7 +167,6 @@ def estimate(rows: GainRows, n_views: int, white_balance: bool = True, vignettin
         normal += gauge * max(float(np.trace(normal)) / len(theta), 1e-12)
         # A channel that is saturated where two groups of views overlap does not tie them to each other: their chroma does.
         if white_balance:
-            chroma = np.kron(np.eye(n_views), np.eye(3) - 1 / 3)
             normal[: 3 * n_views, : 3 * n_views] += chroma * max(scale, 1e-3) ** 2 / _CHROMA_SIGMA**2
         if vignetting:
             normal[[-2, -1], [-2, -1]] += max(scale, 1e-3) ** 2 / _VIGNETTING_SIGMA**2  # rows count 1, not 1 / scale^2

@@ -231,8 +231,8 @@ def _registered(job: Job, writer: RenderedWriter, rendered: Rendered, room: Room
     factor, frames, photos = focal_factor(stream(job.seed, "focal")), [], []
     for number, view in enumerate(out.views):
         depth = writer.writer.channels(f"gbuffer/{view.name}.exr")["depth.Z"]
-        seen, pixels = view.points(depth, np.float64)[depth > 0], POSE_ERROR / effects(job.settings.capture).reduced
-        view = misplaced(view, seen, stream(job.seed, "pose", view.view_id), pixels)
+        seen, error = view.points(depth, np.float64)[depth > 0], POSE_ERROR / effects(job.settings.capture).reduced
+        view = misplaced(view, seen, stream(job.seed, "pose", view.view_id), error)
         camera = pinhole(replace(view, fx=factor * view.fx, fy=factor * view.fy))
         frame = Frame(view.name, view.name, Path(view.name), 1, camera, Distortion("radial_tangential"), view.world_from_camera)
         small = view_of(frame, view.world_from_camera, number, (registration.WIDTH, registration.WIDTH))

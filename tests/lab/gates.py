@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
-import lab  # noqa: F401  for the sources of the laboratory
 from iif_core.fitting.intervals import MeasuredErrors
 from lab.benchmarks.object_intervals import measured, rooms_of
 from workflow.decisions import held
