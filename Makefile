@@ -87,8 +87,9 @@ status:
 
 always:
 
-# A file's tests stay in one process, because they share what its fixtures made.
-IN_PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
+# A file's tests stay in one process, because they share what its fixtures made. A process that dies ends the run, because the
+# other would wait for ever for a new one.
+IN_PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 # All tests but those marked `long`, which test-all adds; times are in docs/development/testing.md.
 test: setup node
 	$(PYTHON_BIN) -m pytest $(IN_PARALLEL) -m "not long" $(PYTEST_ARGS)

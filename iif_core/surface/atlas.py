@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from iif_core.errors import InputError
 from iif_core.surface.triangles import face_geometry
+from iif_core.surface.xatlas_process import pack
 
 PADDING = 4
 """Texels between two charts: two levels of mip maps do not mix them; beyond, every texel has the value of the nearest chart."""
@@ -81,38 +82,31 @@ def unwrap(meshes: Sequence[tuple[NDArray, NDArray]], density: ArrayLike, larges
     Raises:
         InputError: the charts do not fit at any density, because there are too many.
     """
-    import xatlas
-
     density = np.asarray(density, np.float64)
     # First guess: charts fill the share FULL of the largest atlas. Each round that does not fit lowers all densities.
     texels = sum(d * d * face_geometry(*mesh)[1].sum() for mesh, d in zip(meshes, density, strict=True))
     scale = min(1.0, float(largest * np.sqrt(FULL / max(texels, 1e-12))))
     for _ in range(_ROUNDS):
-        atlas = xatlas.Atlas()
+        scaled = []
         for (vertices, faces), own in zip(meshes, density, strict=True):
             middle = vertices.mean(0)  # small numbers lose less in single precision
-            atlas.add_mesh(((vertices - middle) * (own * scale / _UNIT)).astype(np.float32), faces.astype(np.uint32))
-        options = xatlas.PackOptions()
-        options.padding, options.bilinear = PADDING, True
-        options.texels_per_unit, options.resolution = _UNIT, 0
-        atlas.generate(xatlas.ChartOptions(), options, False)
-        width, height = int(atlas.width), int(atlas.height)
-        if 0 < max(width, height) <= largest and atlas.atlas_count == 1:
+            scaled.append((((vertices - middle) * (own * scale / _UNIT)).astype(np.float32), faces.astype(np.uint32)))
+        packed = pack(scaled, PADDING, _UNIT)
+        width, height = packed.width, packed.height
+        if 0 < max(width, height) <= largest and packed.atlases == 1:
             break
         scale *= min(0.97, 0.99 * largest / max(width, height, 1))
     else:
-        raise InputError(f"texture atlas: {atlas.chart_count} charts do not fit into {largest} x {largest} texels; raise it")
+        raise InputError(f"texture atlas: {packed.charts} charts do not fit into {largest} x {largest} texels; raise it")
     size = min(STEP * -(-max(width, height) // STEP), largest)
     source, uv, new = [], [], []
-    for number in range(len(meshes)):
-        rows, faces, coordinates = atlas.get_mesh(number)
+    for (vertices, _), (rows, faces, coordinates, chart) in zip(meshes, packed.meshes, strict=True):
         source.append(rows.astype(np.int64))
         new.append(faces.astype(np.int64))
-        charts = np.asarray(atlas.get_mesh_vertex_assignment(number)[1]).astype(np.int32)
-        coordinates = coordinates[_nearest_with(charts >= 0, meshes[number][0][rows])]
+        coordinates = coordinates[_nearest_with(chart >= 0, vertices[rows])]
         # Coordinates of xatlas run over its own width and height; the picture is a square of whole steps.
         uv.append((coordinates * np.array([width / size, height / size])).astype(np.float32))
-    return Unwrapped(source, uv, new, size, scale, int(atlas.chart_count))
+    return Unwrapped(source, uv, new, size, scale, packed.charts)
 
 
 def _nearest_with(has: NDArray, points: NDArray) -> NDArray:

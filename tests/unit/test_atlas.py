@@ -1,8 +1,12 @@
 """Texture atlases: charts that do not overlap, texels on the surface that they show, densities, and simpler meshes."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
+from iif_core.surface import xatlas_process
 from iif_core.surface.atlas import (
     SEEN_SHARE,
     STEP,
@@ -82,6 +86,33 @@ def test_more_charts_than_texels_is_a_clear_error():
     many = [(quad + [2 * i, 0, 0], np.array([[0, 1, 2]])) for i in range(300)]
     with refused("32 x 32"):
         unwrap(many, np.full(300, 10.0), 32)
+
+
+@pytest.mark.parametrize("crashes, works", [(1, True), (100, False)])
+def test_a_crash_of_xatlas_is_tried_again(monkeypatch, crashes, works):
+    """Its threads race, so that a call now and then dies of a signal; one that always does is an error with a name."""
+    run, left = subprocess.run, iter(range(crashes))
+
+    def dies(command, **options):
+        crash = next(left, None) is not None
+        return run([sys.executable, "-c", "import os; os.kill(os.getpid(), 11)"] if crash else command, **options)
+
+    monkeypatch.setattr(xatlas_process.subprocess, "run", dies)
+    if works:
+        assert unwrap([sphere(12)], [50.0], 1024).charts > 0
+    else:
+        with pytest.raises(RuntimeError):
+            unwrap([sphere(12)], [50.0], 1024)
+        assert 1 < crashes - len(list(left)) < 20
+
+
+def test_an_error_of_the_child_is_not_tried_again_and_is_told(monkeypatch):
+    calls = []
+    run = subprocess.run
+    monkeypatch.setattr(xatlas_process.subprocess, "run", lambda *args, **options: calls.append(1) or run(*args, **options))
+    with pytest.raises(RuntimeError, match="TypeError|ValueError"):
+        xatlas_process.pack([(np.zeros((3, 2), np.float32), np.zeros((1, 3), np.uint32))], 4, 1.0)
+    assert len(calls) == 1
 
 
 def test_a_face_without_area_is_in_no_chart_and_harms_none():
