@@ -344,7 +344,8 @@ def run_in_threads(work: Callable[[np.ndarray], None], px: Pixels, objects: np.n
     if threads < 2 or len(objects) < 2:
         work(objects)
         return
-    # Parts of about equal numbers of pixels. An object is never split, so its sums have one order whatever the number of threads.
-    cuts = np.searchsorted(done, np.linspace(0, done[-1], threads + 1)[1:-1])
+    # Parts of about equal numbers of pixels: an object belongs to the part that holds its middle pixel. It is never split, so its
+    # sums have one order whatever the number of threads.
+    cuts = np.searchsorted(done - px.counts[objects] / 2, np.linspace(0, done[-1], threads + 1)[1:-1])
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, np.split(objects, cuts)))

@@ -215,15 +215,16 @@ def _span(low: float, high: float, show: Any) -> str:
 def duration(seconds: float) -> str:
     """Return seconds as text.
 
-    >>> [duration(x) for x in (0.4, 42.4, 100, 4000)]
-    ['1 s', '42 s', '1 min 40 s', '1 h 7 min']
+    >>> [duration(x) for x in (0.4, 42.4, 100, 4000, 7199)]
+    ['1 s', '42 s', '1 min 40 s', '1 h 7 min', '2 h 0 min']
     """
     whole = max(1, round(seconds))
     if whole < 60:
         return f"{whole} s"
     if whole < 3600:
         return f"{whole // 60} min {whole % 60} s" if whole % 60 else f"{whole // 60} min"
-    return f"{whole // 3600} h {whole % 3600 // 60} min"
+    hours, minutes = divmod(round(whole / 60), 60)
+    return f"{hours} h {minutes} min"
 
 
 def size(mb: float) -> str:

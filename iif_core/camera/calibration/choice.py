@@ -113,7 +113,7 @@ def calibrate_response(
     stops = max(channel.stops for channel in channels)
     if not enough:
         gains = gains if given else _gains(rows, response(families[0]), CameraGains.plain(exposure), choose=True)
-        return _unknown(families[0], stops, sum(len(c.cell) for c in channels), gains, given)
+        return _unknown(families[0], stops, max(len(c.cell) for c in channels), gains, given)
     common = concatenate_channels([channel_rows(rows, c, gains, saturation, MAX_ROWS // len(enough)) for c in enough])
     if not given:
         # The terms of the gains are chosen under the richest curve, fitted with one gain per view: under a wrong curve,
@@ -216,7 +216,7 @@ def _unknown(family: str, stops: float, rows: int, gains: CameraGains, given: bo
     if stops < MIN_STOPS:
         reason = f"exposures differ by less than {MIN_STOPS:g} stop where photographs overlap: taken as {family}"
     else:
-        reason = f"{rows} rows of surface under different exposures, {_MIN_ROWS} needed: taken as {family}"
+        reason = f"{rows} rows of surface under different exposures in the best channel, {_MIN_ROWS} needed: taken as {family}"
     covariance = _SIGMA**2 * np.eye(start.params.size)
     return CalibratedResponse(start, covariance, stops, 0, 0.0, 0.0, [], reason, gains.exposure, gains=None if given else gains)
 
