@@ -26,10 +26,10 @@ import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import lab  # noqa: F401  for the sources of the laboratory
-from iif_core.fitting import object_levels
+from iif_core.fitting import direct, object_levels
 from iif_core.fitting.object_levels import ObjectLevels, compare_levels
 
-TABLE = Path(__file__).resolve().parents[2] / "docs" / "results" / "data" / "object_levels.csv"
+TABLE = Path(__file__).resolve().parents[2] / "lab/notebook/data/object_levels.csv"
 COLOURS = ("base", "shown", "true")
 COLUMNS = ("room", "object", *(f"{n}_{c}" for n in COLOURS for c in "rgb"), "scatter", "smooth", "pixels", "count", "stated")
 LEAST_OBJECTS = 3
@@ -42,26 +42,25 @@ def measured(folder: Path, scene: str) -> pd.DataFrame:
     from workflow.artifacts.store import StageReader, ids_from_disk
     from workflow.runtime.job import run_stage
     from workflow.scene.normal_form import CaptureReader
-    from workflow.stages import affines
 
     asked, stated, objects = [], [], []
-    compare, fit = object_levels.compare_levels, affines.fit_affines
+    compare, measure = object_levels.compare_levels, direct.measure_texture
 
     def compared(*arguments: Any) -> ObjectLevels:
         asked.append([np.array(a) for a in arguments[:5]])
         stated.append(arguments[6])
         return compare(*arguments)
 
-    def fitted(problem, start, options):
-        pixels = np.bincount(problem.object_id[problem.object_id >= 0])
-        objects.append(np.flatnonzero(pixels >= options.min_pixels))
-        return fit(problem, start, options)
+    def fitted(found, options):
+        texture = measure(found, options)
+        objects.append(np.flatnonzero(texture.enough))
+        return texture
 
-    object_levels.compare_levels, affines.fit_affines = compared, fitted
+    object_levels.compare_levels, direct.measure_texture = compared, fitted
     try:
         run_stage("affines", scene, "draft", 1, None)
     finally:
-        object_levels.compare_levels, affines.fit_affines = compare, fit
+        object_levels.compare_levels, direct.measure_texture = compare, measure
     base, shown, scatter, smooth, pixels = asked[-1]
     own = objects[0]
     assert len(own) == len(base), f"{scene}: {len(own)} objects with pixels, {len(base)} in the fit"
