@@ -54,18 +54,18 @@ class OtherPhotographs:
         return Shown(view, radiance.astype(np.float32), valid & (face >= 0), bound.any(-1), depth)
 
     def predictions(self, view: View, photo: np.ndarray, counted: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-        """Yield (variant, sensor values (H, W, 3)) of a held-out view; a pixel that no used photograph shows has the colour of
-        its neighbour.
+        """Yield (variant, sensor values (H, W, 3)) of a view by the other photographs that are used; a pixel that none of these
+        shows has the colour of its neighbour.
 
         Args:
-            view: held out.
+            view: held out, or used: then its own photograph is left out.
             photo: (H, W, 3) and counted: (H, W), what it shows and where it is scored, for its gain where that is not known.
         """
         depth, face = self._capture.gbuffer(view)
         eye, at = view.world_from_camera[:3, 3], np.flatnonzero(face >= 0)
         points = view.points(depth, np.float64).reshape(-1, 3)[at]
         normals, _ = towards_viewer(self._normals[face.ravel()[at]], eye - points)
-        others = [self.shown(other) for other in self._capture.used]
+        others = [self.shown(other) for other in self._capture.used if other.view_id != view.view_id]
         pictures = np.full((2, view.height * view.width, 3), np.nan)
         for start in range(0, len(at), BLOCK):
             part = slice(start, start + BLOCK)
