@@ -26,8 +26,8 @@ class Packed:
         width, height: texels; 0 where nothing was packed.
         atlases: pictures that were needed.
         charts: number of charts.
-        meshes: for each mesh, the given vertex of each new one (v,), the faces (m, 3) of new vertices, their coordinates (v, 2) in
-            texels over (width, height), and the chart of each new vertex (v,), -1 in none.
+        meshes: for each mesh, the given vertex of each new one (v,), the faces (m, 3) of new vertices, their coordinates (v, 2),
+            of which 1 is the width or height, and the chart of each new vertex (v,), -1 in none.
     """
 
     width: int

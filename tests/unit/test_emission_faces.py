@@ -9,6 +9,7 @@ from iif_core.light.emission.candidates import (
     FaceStatistics,
     emitter_candidates,
     face_statistics,
+    fading_surface,
     glowing_pieces,
     radiance_threshold,
 )
@@ -272,6 +273,79 @@ def test_a_lamp_that_is_cut_into_many_objects_stays_one():
     assert len(np.unique(glowing[:12])) == 6 and (glowing[12:] == -1).all()
     out = group_emitters(brightness > 1, stats, adjacency, normals, areas, glowing=glowing)
     assert out.size == 1 and (out.of_face[:12] == 0).all()
+
+
+def _ceiling(size=24):
+    """A ceiling of size x size m in quads of 1 m: centres (n, 2) from its middle, areas, normals and neighbours of the faces."""
+    i, j = np.meshgrid(np.arange(size + 1), np.arange(size + 1), indexing="ij")
+    vertices = np.stack([i.ravel(), j.ravel(), np.zeros(i.size)], 1).astype(float)
+    at = (np.arange(size)[:, None] * (size + 1) + np.arange(size)).ravel()
+    faces = np.stack([at, at + size + 1, at + size + 2, at, at + size + 2, at + 1], 1).reshape(-1, 3)
+    normals, areas = face_geometry(vertices, faces)
+    return vertices[faces].mean(1)[:, :2] - size / 2, areas, normals, face_adjacency(faces)
+
+
+def _fading(brightness, candidate, parts, **options):
+    _, areas, normals, adjacency = parts
+    statistics = _statistics(np.full(len(areas), 20), brightness)
+    return fading_surface(candidate, replace(statistics, **options.pop("seen", {})), adjacency, normals, areas, **options)
+
+
+def test_light_on_a_ceiling_fades_and_a_lamp_in_it_does_not():
+    parts = _ceiling()
+    radius = np.linalg.norm(parts[0], axis=1)
+    spot = 8 * np.exp(-0.5 * (radius / 6) ** 2)
+    assert (_fading(spot, spot >= 3, parts) == (spot >= 3)).all() and (spot >= 3).sum() > 200
+    lamp = np.where(radius < 4, 8.0, 0.5)
+    assert not _fading(lamp, lamp >= 3, parts).any()
+    # A lamp is no less of one where it is brighter in its middle.
+    uneven = np.where(radius < 4, 8 * np.exp(-0.5 * (radius / 4) ** 2), 0.5)
+    assert not _fading(uneven, uneven >= 3, parts).any()
+
+
+def test_light_around_a_saturated_lamp_fades_and_takes_the_lamp_not_along():
+    parts = _ceiling()
+    radius = np.linalg.norm(parts[0], axis=1)
+    lamp = radius < 3
+    seen = np.minimum(8 * np.exp(-0.5 * (radius / 7) ** 2), 7)  # the lamp is as bright as the bound, and so is what is next to it
+    found = _fading(seen, seen >= 3, parts, seen={"bounded": lamp, "clear": np.where(lamp, 0, 20).astype(np.int32)})
+    assert (found == (seen >= 3) & ~lamp).all()
+    # Without the bounds, nothing tells the lamp from the light around it.
+    assert _fading(seen, seen >= 3, parts)[lamp].all()
+
+
+def test_what_ends_at_a_crease_does_not_fade():
+    """The front of a shining box, whose sides are hardly darker."""
+    parts = _ceiling()
+    front = np.abs(parts[0]).max(1) < 4
+    brightness = np.where(front, 8.0, 6.0)
+    tilted = np.where(front[:, None], [0.0, 0.0, 1.0], [0.0, np.sin(1.0), np.cos(1.0)])
+    assert _fading(brightness, front, parts)[front].all()
+    assert not _fading(brightness, front, (*parts[:2], tilted, parts[3])).any()
+
+
+def test_a_piece_that_glows_fades_as_a_whole_or_not_at_all():
+    parts = _ceiling()
+    across = np.abs(parts[0][:, 0])
+    curtain = across < 6
+    folds = np.where(parts[0][:, 1] % 2 < 1, 9.0, 3.0)
+    glowing = np.where(curtain, 5, -1).astype(np.int32)
+    assert not _fading(np.where(curtain, folds, 1.0), curtain, parts, glowing=glowing).any()
+    assert _fading(np.where(curtain, folds, folds / 1.2), curtain, parts, glowing=glowing)[curtain].all()
+    # Two of them do not decide for each other.
+    two = np.where(curtain & (parts[0][:, 1] > 0), 6, glowing)
+    half = np.where(curtain & (parts[0][:, 1] > 0), folds, np.where(curtain, folds, folds / 1.2))
+    half[~curtain & (parts[0][:, 1] > 0)] = 1.0
+    found = _fading(half, curtain, parts, glowing=two)
+    assert found[two == 5].all() and not found[two == 6].any()
+
+
+def test_nothing_fades_where_nothing_was_seen_or_nothing_is_bright():
+    parts = _ceiling(2)
+    n = len(parts[1])
+    assert not _fading(np.zeros(n), np.ones(n, bool), parts).any()
+    assert not _fading(np.ones(n), np.zeros(n, bool), parts).any()
+    assert not _fading(np.ones(n), np.arange(n) < 2, parts, seen={"count": np.zeros(n, np.int32)}).any()
 
 
 def test_small_and_surplus_groups_are_dropped_with_a_reason():

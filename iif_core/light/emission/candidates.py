@@ -235,6 +235,55 @@ def _change_over_views(piece: np.ndarray, size: int, face: np.ndarray, view: np.
     return np.sqrt(np.bincount(owner, count * (log_mean - mean[owner]) ** 2, size) / total)
 
 
+LARGEST_STEP = 1.5
+"""Ratio of the radiances of neighbouring faces below which surface goes on without an edge."""
+LARGEST_TURN = 30.0
+"""Degrees between the normals of such faces; the mesh of a scan bulges."""
+_HALF_CIRCLE = float(np.sqrt(np.pi))  # half of the perimeter of a circle of area 1
+_EQUILATERAL = 2.0 / 3.0**0.25  # edge of an equilateral triangle of area 1
+
+
+def fading_surface(
+    candidate: np.ndarray,
+    statistics: FaceStatistics,
+    adjacency: np.ndarray,
+    normals: np.ndarray,
+    areas: np.ndarray,
+    glowing: np.ndarray | None = None,
+) -> np.ndarray:
+    """Find candidates that fade into the surface around them, as light on a ceiling does and no lamp (Eq. L.65).
+
+    Only unsaturated radiance tells: next to a lamp that saturates all photographs, surface is as bright as its bounds.
+
+    Args:
+        candidate: (F,) bool; statistics: of F faces; adjacency: (E, 2) pairs of neighbouring faces.
+        normals, areas: (F, 3) unit vectors, and (F,) m^2.
+        glowing: (F,) from `glowing_pieces`, each of which fades as a whole or not at all; None = none.
+
+    Returns:
+        (F,) bool, a part of `candidate`.
+    """
+    n, (a, b) = len(candidate), adjacency.T
+    brightness = statistics.mean.max(-1).astype(np.float64)
+    told = (statistics.count > 0) & ~statistics.bounded & (2 * statistics.clear >= statistics.count) & (brightness > 0)
+    # -------- edges of the mesh across which surface goes on, and so does its radiance --------
+    flat = (normals[a] * normals[b]).sum(1) > np.cos(np.radians(LARGEST_TURN))
+    step = np.maximum(brightness[a], brightness[b]) < LARGEST_STEP * np.minimum(brightness[a], brightness[b])
+    smooth = told[a] & told[b] & flat & step
+    # -------- patches of candidates that such edges join; a piece that glows is one patch --------
+    inner = smooth & candidate[a] & candidate[b]
+    whole = np.flatnonzero(candidate & (glowing >= 0)) if glowing is not None else np.zeros(0, np.int64)
+    piece = np.unique(glowing[whole], return_inverse=True)[1] if glowing is not None else whole
+    size = n + int(piece.max(initial=-1)) + 1
+    patch = component_labels(size, np.r_[a[inner], whole], np.r_[b[inner], n + piece])[:n]
+    # -------- of their border, what leads on to other surface: half of it is enough (Eq. L.65) --------
+    border = smooth & (candidate[a] != candidate[b])
+    owner = np.where(candidate[a], patch[a], patch[b])[border]
+    length = np.bincount(owner, _EQUILATERAL * np.sqrt(np.minimum(areas[a], areas[b]))[border], size)
+    area = np.bincount(patch[candidate], areas[candidate], size)
+    return candidate & ((length > 0) & (length >= _HALF_CIRCLE * np.sqrt(area)))[patch]
+
+
 def emitter_candidates(
     statistics: FaceStatistics,
     adjacency: np.ndarray,

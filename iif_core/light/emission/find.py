@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.light.emission.candidates import emitter_candidates
+from iif_core.light.emission.candidates import emitter_candidates, fading_surface
 from iif_core.light.emission.direct import EmissionSolution
 from iif_core.light.emission.emitters import (
     Traced,
@@ -108,6 +108,12 @@ def look_around(photos: Photographs, adjacency: np.ndarray) -> FirstLook:
     scene, least = photos.scene, photos.options.min_observations
     statistics, threshold, glowing = statistics_of_faces(photos, adjacency)
     candidate = emitter_candidates(statistics, adjacency, scene.areas, threshold, least, glowing)
+    fades = fading_surface(candidate, statistics, adjacency, scene.normals, scene.areas, glowing)
+    if fades.any():
+        photos.log.say(
+            f"{fades.sum()} bright faces ({scene.areas[fades].sum():.1f} m^2) fade into their surroundings: they are lit"
+        )
+    candidate, glowing = candidate & ~fades, np.where(fades, -1, glowing).astype(glowing.dtype)
     options = GroupingOptions(min_observations=least)
     groups = group_emitters(candidate, statistics, adjacency, scene.normals, scene.areas, options, glowing)
     photos.log.say(f"{candidate.sum()} candidate faces in {groups.size} groups ({len(groups.dropped)} left out)")
