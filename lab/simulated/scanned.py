@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from iif_core.numerics.arrays import unique_rows
 from iif_core.surface.simplify import clean, simplify
@@ -24,6 +25,8 @@ KEPT = 0.25
 """Share of the faces that decimation keeps."""
 EDGE = 0.1
 """Longest edge in metres before the mesh is bent: a fifth of the correlation length."""
+NEAR = 10.0
+"""Distance in metres to the nearest camera up to which that is so; beyond, edges grow with the distance, as pixels of a scan do."""
 _WAVES = 64
 
 
@@ -62,7 +65,9 @@ class Scanned:
     emission: Array
 
 
-def scanned(vertices: Array, faces: Array, ids: Array, emission: Array, rng: np.random.Generator) -> Scanned:
+def scanned(
+    vertices: Array, faces: Array, ids: Array, emission: Array, rng: np.random.Generator, eyes: Array | None = None
+) -> Scanned:
     """Scan a mesh: bend it, cut holes, decimate it.
 
     Args:
@@ -71,11 +76,12 @@ def scanned(vertices: Array, faces: Array, ids: Array, emission: Array, rng: np.
         emission: (m, 3) radiance of each face. Faces that shine are bent, but have no holes and are not decimated: the loss of a
             lamp would be another question.
         rng: random numbers.
+        eyes: (v, 3) positions of the cameras; None = all surface is near one.
     """
     kinds, part = unique_rows(np.column_stack([ids, emission]).astype(np.float64))
     count = ids.shape[1]
     rows, local = unique_rows(np.column_stack([vertices[faces].reshape(-1, 3).astype(np.float64), np.repeat(part, 3)]))
-    vertices, faces, source = refined(rows[:, :3], local.reshape(-1, 3), EDGE)
+    vertices, faces, source = refined(rows[:, :3], local.reshape(-1, 3), EDGE, eyes)
     part, whole = part[source], kinds[:, count:].any(1)
     left = clean(faces, vertices) & without_holes(vertices, faces, whole[part], HOLES, rng)
     vertices, faces, part = vertices + drawn_bend(vertices, faces, rng)(vertices), faces[left], part[left]
@@ -107,17 +113,23 @@ def drawn_bend(vertices: Array, faces: Array, rng: np.random.Generator) -> Bend:
     return Bend(wave, phase, bend.size * BULGE / median)
 
 
-def refined(vertices: Array, faces: Array, longest: float) -> tuple[Array, Array, Array]:
+def refined(vertices: Array, faces: Array, longest: float, eyes: Array | None = None) -> tuple[Array, Array, Array]:
     """Halve edges until none is longer than `longest`; both faces of an edge are cut, so a closed mesh stays closed.
+
+    An edge whose middle is farther than `NEAR` from the nearest of the `eyes` may be longer by that ratio.
 
     Returns:
         Vertices, faces, and the given face (m',) that each lies on.
     """
     source = np.arange(len(faces))
+    cameras = None if eyes is None else cKDTree(eyes)
     while True:
         ends = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1), -1).reshape(-1, 2)
         edges, edge = np.unique(ends, axis=0, return_inverse=True)
-        long = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1) > longest
+        allowed = np.full(len(edges), longest)
+        if cameras is not None:
+            allowed *= np.maximum(cameras.query(vertices[edges].mean(1))[0] / NEAR, 1.0)
+        long = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1) > allowed
         if not long.any():
             return vertices, faces, source
         middle = np.where(long, len(vertices) + np.cumsum(long) - 1, -1)[edge.reshape(-1, 3)]

@@ -99,7 +99,7 @@ class _Capture:
         instance = instance.astype(np.int32)
         mesh, owner = self.mesh, instance
         if effects(self.settings).mesh:
-            mesh = self._scanned(instance)
+            mesh = self._scanned(instance, views)
             owner = mesh.ids[:, 0]
         self.writer.mesh(mesh.vertices, mesh.faces, owner, names, mesh.emission)
         with tempfile.TemporaryFile() as scratch:
@@ -269,13 +269,13 @@ class _Capture:
         shape = (view.height, view.width)
         return np.where(face >= 0, t, 0).reshape(shape).astype(np.float32), face.reshape(shape), truth
 
-    def _scanned(self, instance: Array) -> Scanned:
+    def _scanned(self, instance: Array, views: list[View]) -> Scanned:
         """Return the mesh as a scan of it would be."""
         from lab.simulated.realism import stream
         from lab.simulated.scanned import scanned
 
-        rng = stream(self.job.seed, "mesh")
-        return scanned(self.mesh.vertices, self.mesh.faces, instance[:, None], self.mesh.emission, rng)
+        rng, eyes = stream(self.job.seed, "mesh"), np.stack([view.world_from_camera[:3, 3] for view in views])
+        return scanned(self.mesh.vertices, self.mesh.faces, instance[:, None], self.mesh.emission, rng, eyes)
 
     def _normals(self, view: View, face: Array) -> Array:
         """Return world normals towards the camera (H, W, 3), 0 where nothing is hit."""

@@ -197,6 +197,27 @@ def test_refining_keeps_a_closed_mesh_closed():
     np.testing.assert_allclose(((corner.mean(1) - vertices[faces[source, 0]]) * normal[source]).sum(1), 0, atol=1e-12)
 
 
+def test_what_is_far_from_all_cameras_is_scanned_more_coarsely():
+    corners, faces = np.array([[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    fine, cut, _ = scanned.refined(corners, faces, 0.5, np.array([[0, 0, 1.5]]))
+    assert len(cut) < len(scanned.refined(corners, faces, 0.5)[1]) / 3 and face_geometry(fine, cut)[1].sum() == pytest.approx(
+        100.0**2
+    )
+    directed = np.sort(cut[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+    ends, times = np.unique(directed, axis=0, return_counts=True)
+    length, middle = np.linalg.norm(fine[ends[:, 0]] - fine[ends[:, 1]], axis=1), fine[ends].mean(1)
+    distance = np.linalg.norm(middle - [0, 0, 1.5], axis=1)
+    assert (length <= 0.5 * np.maximum(distance / scanned.NEAR, 1) + 1e-9).all() and length[distance > 40].max() > 1.0
+    assert (times[(np.abs(middle) < 49.9).all(1)] == 2).all()  # no edge is cut on one side alone
+
+
+def test_near_surface_is_scanned_alike_wherever_the_cameras_are():
+    box = shapes.box((0, 0, 0), (3, 2, 2))[:2]
+    plain, near = scanned.refined(*box, 0.1), scanned.refined(*box, 0.1, np.array([[1.0, 1, 1], [2, 1, 1]]))
+    for one, other in zip(plain, near, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_holes_take_their_share_and_no_lamp():
     vertices, faces, _ = scanned.refined(*shapes.box((0, 0, 0), (3, 2, 2)), 0.1)
     area = face_geometry(vertices, faces)[1]
