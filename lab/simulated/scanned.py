@@ -26,7 +26,7 @@ KEPT = 0.25
 EDGE = 0.1
 """Longest edge in metres before the mesh is bent: a fifth of the correlation length."""
 NEAR = 10.0
-"""Distance in metres to the nearest camera up to which that is so; beyond, edges grow with the distance, as pixels of a scan do."""
+"""Distance in metres to the nearest camera up to which that is so; beyond, edges grow with it, as the pixels of a scan do."""
 _WAVES = 64
 
 
