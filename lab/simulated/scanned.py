@@ -83,7 +83,8 @@ def scanned(
     rows, local = unique_rows(np.column_stack([vertices[faces].reshape(-1, 3).astype(np.float64), np.repeat(part, 3)]))
     vertices, faces, source = refined(rows[:, :3], local.reshape(-1, 3), EDGE, eyes)
     part, whole = part[source], kinds[:, count:].any(1)
-    left = clean(faces, vertices) & without_holes(vertices, faces, whole[part], HOLES, rng)
+    far = np.zeros(len(faces), bool) if eyes is None else cKDTree(eyes).query(vertices[faces].mean(1))[0] > 2 * NEAR
+    left = clean(faces, vertices) & without_holes(vertices, faces, whole[part], HOLES, rng, far)
     vertices, faces, part = vertices + drawn_bend(vertices, faces, rng)(vertices), faces[left], part[left]
     fixed = whole[part]
     simple = simplify(vertices, faces[~fixed], part[~fixed], max(1, round(KEPT * int((~fixed).sum()))))
@@ -155,24 +156,29 @@ def _cut(faces: Array, middle: Array, source: Array) -> tuple[Array, Array]:
     return np.concatenate(out), np.concatenate(of)
 
 
-def without_holes(vertices: Array, faces: Array, whole: Array, share: float, rng: np.random.Generator) -> Array:
+def without_holes(
+    vertices: Array, faces: Array, whole: Array, share: float, rng: np.random.Generator, far: Array | None = None
+) -> Array:
     """Return which faces (m,) are left when round holes have taken `share` of the area, to within a face.
 
     Args:
         vertices, faces: the mesh, metres.
         whole: (m,) bool, faces that are never taken.
-        share: of the area of all faces.
+        share: of the area of all faces but those that are `far`.
         rng: random numbers.
+        far: (m,) bool, faces that are not taken either, and do not count; None = none.
     """
+    far = np.zeros(len(faces), bool) if far is None else far
     area, middle = face_geometry(vertices, faces)[1], vertices[faces].mean(1)
-    left, to_take = np.ones(len(faces), bool), share * area.sum()
-    open_area = np.where(whole, 0.0, area)
+    left, to_take, whole = np.ones(len(faces), bool), share * area[~far].sum(), whole | far
+    open_area, tree = np.where(whole, 0.0, area), cKDTree(middle)
     to_take = min(to_take, open_area.sum())
     while to_take > 0 and (open_area[left] > 0).any():
         weight = open_area * left
-        distance = np.linalg.norm(middle - middle[rng.choice(len(faces), p=weight / weight.sum())], axis=1)
-        near = np.flatnonzero((distance <= rng.uniform(*HOLE)) & left & ~whole)
-        near = near[np.argsort(distance[near], kind="stable")]
+        centre, radius = middle[rng.choice(len(faces), p=weight / weight.sum())], rng.uniform(*HOLE)
+        near = np.sort(tree.query_ball_point(centre, radius))
+        near = near[left[near] & ~whole[near]]
+        near = near[np.argsort(np.linalg.norm(middle[near] - centre, axis=1), kind="stable")]
         taken = near[np.cumsum(area[near]) - area[near] < to_take]
         left[taken] = False
         to_take -= area[taken].sum()

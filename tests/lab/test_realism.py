@@ -227,6 +227,9 @@ def test_holes_take_their_share_and_no_lamp():
     assert 0.03 <= share <= 0.03 + area.max() / area.sum() and left[lamp].all()
     all_but_lamps = scanned.without_holes(vertices, faces, lamp, 1.0, rng(7))
     np.testing.assert_array_equal(all_but_lamps, lamp)
+    far = vertices[faces][:, :, 0].min(1) > 1.5
+    left = scanned.without_holes(vertices, faces, lamp, 0.03, rng(7), far)
+    assert left[far].all() and 0.03 <= area[~left].sum() / area[~far].sum() <= 0.03 + area.max() / area[~far].sum()
 
 
 def test_the_bend_has_its_size_and_correlation():
