@@ -1,15 +1,15 @@
 """Whether the 95 % intervals of `objects.csv` hold the truth, and the numbers from which they are made.
 
-    python lab/benchmarks/object_intervals.py --make sky lamps [--variant small]       photograph rooms, fit, measure
-    python lab/benchmarks/object_intervals.py kitchen modern-hall [--quality draft]    measure scenes that are finished
-    python lab/benchmarks/object_intervals.py                                          the constants and tables alone
+    python lab/benchmarks/object_intervals.py sky--rooms_learned-raw-s0 [--quality draft]   measure scenes that are finished
+    python lab/benchmarks/object_intervals.py --make sky lamps [--variant small]            photograph rooms, fit, measure
+    python lab/benchmarks/object_intervals.py                                               the constants and tables alone
 
 Run it in a working folder. `--make` takes any scenes of lab/config/studies/scenes.yaml, under the settings of a variant of study
 `intervals`, up to stage affines, one after the other. The rows of each room, one for each object, replace those that it had in
-lab/notebook/data/object_intervals.csv as soon as it is finished. Of all rooms there, the command then writes
-workflow/decisions/intervals.json, which the product reads, and the tables of lab/notebook/intervals.md. Truth and estimate of
-an object are means over its surface cells, which have equal areas; truth is known where photographs show it, and objects with
-fewer such cells than `--cells` are left out.
+lab/notebook/data/object_intervals.csv as soon as it is finished. The rooms there that were captured as they are, but for those of
+the gates, then set the constants in workflow/decisions/intervals.json, which the product reads; all rooms are in the tables of
+lab/notebook/intervals.md. Truth and estimate of an object are means over its surface cells, which have equal areas; truth is
+known where photographs show it, and objects with fewer such cells than `--cells` are left out.
 """
 
 from __future__ import annotations
@@ -50,6 +50,10 @@ COLUMNS = (
     "scene", "object", "cells", "pixels", "room_error", "level", "seen",
     *CHANNELS, *(f"true_{name}" for name in CHANNELS), *(f"{name}_{k}" for name in KINDS for k in range(3)),
 )  # fmt: skip
+IDEAL = "--intervals-small-"
+"""In the names of scenes that were captured without errors."""
+KEPT_BACK = ("tiny", "tiny-gloss", "gloss")
+"""Rooms that set no constant, because the gates of `make test` are on them (tests/lab/gates.py)."""
 DARK, FEW = 0.1, 500
 """Objects of a lower albedo or of fewer pixels do not tell the error of hue: the additive error and borders hide it there."""
 HELD = {
@@ -266,14 +270,19 @@ def _mean(values: Array) -> float:
     return float(values.mean()) if len(values) else np.nan
 
 
-def left_out(rooms: Sequence[Room]) -> list[dict[str, float]]:
-    """Return the coverage of each room under what all rooms of other names say."""
-    return [coverage(room, fitted([other for other in rooms if other.name != room.name])) for room in rooms]
+def that_set(rooms: Sequence[Room]) -> list[Room]:
+    """Return the rooms that set the constants."""
+    return [room for room in rooms if IDEAL not in room.scene and room.name not in KEPT_BACK]
 
 
-def terms(rooms: Sequence[Room]) -> list[list[str]]:
+def left_out(rooms: Sequence[Room], told: Sequence[Room]) -> list[dict[str, float]]:
+    """Return the coverage of each room under what the rooms of other names among those that were `told` say."""
+    return [coverage(room, fitted([other for other in told if other.name != room.name])) for room in rooms]
+
+
+def terms(rooms: Sequence[Room], told: Sequence[Room]) -> list[list[str]]:
     """Return what each term adds to the intervals of albedo: shares of channels held and half widths, means over the rooms."""
-    everything = fitted(rooms)
+    everything = fitted(told)
     none = replace(everything, additive=1e-6, hue=1e-6, border=1e-6)
     normal = float(student_width(np.inf) / student_width(4.0))
 
@@ -294,7 +303,7 @@ def terms(rooms: Sequence[Room]) -> list[list[str]]:
     for name, change, errors, factor in steps:
         found = [coverage(change(room), replace(errors, albedo=factor)) for room in rooms]
         out.append([name, *_summary(found)])
-    return [*out, ["the factor, from the other rooms", *_summary(left_out(rooms))]]
+    return [*out, ["the factor, from the other rooms", *_summary(left_out(rooms, told))]]
 
 
 def _summary(found: Sequence[Mapping[str, float]]) -> list[str]:
@@ -305,8 +314,8 @@ def _summary(found: Sequence[Mapping[str, float]]) -> list[str]:
 # -------------------------------------------------------------------------------------------------------------- writing
 
 
-def document(rooms: Sequence[Room], found: Sequence[Mapping[str, float]], errors: MeasuredErrors) -> dict[str, Any]:
-    """Return what the product reads."""
+def document(told: Sequence[Room], found: Sequence[Mapping[str, float]], errors: MeasuredErrors) -> dict[str, Any]:
+    """Return what the product reads: `errors` of the rooms that were `told`, and what was `found` in rooms as captured."""
     held = {}
     for name, (share, width) in HELD.items():
         shares = [row[share] for row in found if np.isfinite(row[share])]
@@ -315,7 +324,13 @@ def document(rooms: Sequence[Room], found: Sequence[Mapping[str, float]], errors
     numbers = {name: float(f"{value:.4g}") for name, value in vars(errors).items()}
     held = {name: {key: round(value, 4) for key, value in entry.items()} for name, entry in held.items()}
     metals, inside = _metals(found)
-    return {"errors": numbers, "held": held, "metals": {"true": metals, "held": inside}, "rooms": [room.scene for room in rooms]}
+    return {
+        "errors": numbers,
+        "held": held,
+        "metals": {"true": metals, "held": inside},
+        "rooms": len(found),
+        "told_by": [room.scene for room in told],
+    }
 
 
 def _metals(found: Sequence[Mapping[str, float]]) -> tuple[int, int]:
@@ -324,13 +339,15 @@ def _metals(found: Sequence[Mapping[str, float]]) -> tuple[int, int]:
     return round(sum(row["metals"] for row in found)), round(held)
 
 
-def tables(rooms: Sequence[Room], found: Sequence[Mapping[str, float]], errors: MeasuredErrors) -> dict[str, str]:
-    """Return the tables of the page."""
+SHARES = ("albedo", "brightness", "roughness_of_claimed", "metallic")
+
+
+def of_rooms(pairs: Sequence[tuple[Room, Mapping[str, float]]]) -> list[str]:
+    """Return the table of coverage, with a line for each room."""
     from workflow.report.blocks import markdown
 
-    shares = ("albedo", "brightness", "roughness_of_claimed", "metallic")
-    rows = []
-    for room, row in zip(rooms, found, strict=True):
+    shares, rows, found = SHARES, [], [row for _, row in pairs]
+    for room, row in pairs:
         level = f"{room.level_error:+.2f} ± {student_width(np.inf) * room.room_error:.2f}"
         rows.append([room.name, f"{row['objects']:.0f}", *(_percent(row[name]) for name in shares), level, *_widths(row)])
     means = {name: float(np.nanmean([row[name] for row in found])) for name in found[0]}
@@ -353,20 +370,33 @@ def tables(rooms: Sequence[Room], found: Sequence[Mapping[str, float]], errors: 
         "level of the room, error ± half of 95 %",
     ]
     heads += ["half width: R, G, B", "relative, of the surface", "roughness", "roughness claimed of"]
-    metals, held = _metals(found)
+    return markdown(heads, rows)
+
+
+def tables(
+    rooms: Sequence[Room], told: Sequence[Room], found: Sequence[Mapping[str, float]], errors: MeasuredErrors
+) -> dict[str, str]:
+    """Return the tables of the page: what was `found` in all rooms, by those that were `told`."""
+    from workflow.report.blocks import markdown
+
+    pairs = list(zip(rooms, found, strict=True))
+    captured, ideal = ([pair for pair in pairs if (IDEAL in pair[0].scene) == which] for which in (False, True))
+    metals, held = _metals([row for _, row in captured])
     numbers = [[name, f"{value:.3g}"] for name, value in vars(errors).items()]
     numbers += [["true metals that their interval holds", f"{held} of {metals}"]]
-    level = [room.level_error for room in rooms]
-    numbers += [["level of the room: mean error, and root mean square in claimed errors", _level(level, rooms)]]
+    numbers += [["level of the room: mean error, and root mean square in claimed errors", _level([room for room, _ in captured])]]
+    heads = ["with", "R, G, B held", "in a room", "half width, relative, of the surface"]
     return {
-        "intervals": "\n".join(markdown(heads, rows)),
-        "terms": "\n".join(markdown(["with", "R, G, B held", "in a room", "half width, relative, of the surface"], terms(rooms))),
+        "intervals": "\n".join(of_rooms(captured)),
+        "ideal": "\n".join(of_rooms(ideal)),
+        "terms": "\n".join(markdown(heads, terms([room for room, _ in captured], told))),
         "constants": "\n".join(markdown(["number", "value"], numbers)),
     }
 
 
-def _level(errors: Sequence[float], rooms: Sequence[Room]) -> str:
-    ratio = np.array(errors) / [room.room_error for room in rooms]
+def _level(rooms: Sequence[Room]) -> str:
+    errors = np.array([room.level_error for room in rooms])
+    ratio = errors / [room.room_error for room in rooms]
     return f"{np.mean(errors):+.2f}, {np.sqrt(np.mean(ratio**2)):.1f}"
 
 
@@ -398,9 +428,11 @@ def main() -> None:
         keep(scene, rows)
         print(f"{scene}: {len(rows)} objects")
     rooms = rooms_of(_table())
-    found, errors = left_out(rooms), fitted(rooms)
-    FILE.write_text(json.dumps(document(rooms, found, errors), indent=1) + "\n")
-    PAGE.write_text(fill(PAGE.read_text(), tables(rooms, found, errors)))
+    told = that_set(rooms)
+    found, errors = left_out(rooms, told), fitted(told)
+    as_captured = [row for room, row in zip(rooms, found, strict=True) if IDEAL not in room.scene]
+    FILE.write_text(json.dumps(document(told, as_captured, errors), indent=1) + "\n")
+    PAGE.write_text(fill(PAGE.read_text(), tables(rooms, told, found, errors)))
     print(FILE.read_text())
 
 

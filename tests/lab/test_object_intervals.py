@@ -13,6 +13,7 @@ from iif_core.errors import InputError
 from iif_core.fitting.intervals import MeasuredErrors
 from iif_core.fitting.problem import Kinds
 from lab.benchmarks import object_intervals as measurement
+from tests.lab import gates
 from workflow.decisions.held import FILE
 
 TRUE = MeasuredErrors(additive=0.01, border=0.4, hue=0.05, albedo=1.0, roughness=1.0, metallic=1.0)
@@ -44,9 +45,17 @@ def test_a_room_is_judged_by_the_others_alone():
     """The room of larger errors is not held by what others say, however many variants of it there are."""
     rooms = [room(seed, objects=80) for seed in range(5)]
     odd = replace(room(9, scale=8.0, objects=80), scene="odd--intervals-small-s0")
-    shares = [row["albedo"] for row in measurement.left_out([*rooms, odd, replace(odd, scene="odd--intervals-other-s0")])]
+    every = [*rooms, odd, replace(odd, scene="odd--intervals-other-s0")]
+    shares = [row["albedo"] for row in measurement.left_out(every, every)]
     assert min(shares[:5]) > 0.9 and max(shares[5:]) < 0.7
-    assert np.mean([row["albedo"] for row in measurement.left_out(rooms)]) == pytest.approx(0.95, abs=0.025)
+    assert np.mean([row["albedo"] for row in measurement.left_out(rooms, rooms)]) == pytest.approx(0.95, abs=0.025)
+
+
+def test_neither_ideal_captures_nor_the_rooms_of_the_gates_set_a_constant():
+    names = ("sky--rooms_learned-raw-s0", "sky--intervals-small-s0", "gloss--rooms_learned-raw-s0", "tiny--intervals-captured-s0")
+    rooms = [replace(room(seed), scene=name) for seed, name in enumerate(names)]
+    assert [told.scene for told in measurement.that_set(rooms)] == [names[0]]
+    assert set(measurement.KEPT_BACK) == set(gates.ROOMS)
 
 
 def test_too_few_objects_make_no_constants():
@@ -68,9 +77,10 @@ def test_rows_of_a_scene_replace_those_that_it_had(tmp_path, monkeypatch):
 
 def test_the_file_of_the_product_is_what_the_table_says():
     rooms = measurement.rooms_of(measurement._table())
-    found = measurement.document(rooms, measurement.left_out(rooms), measurement.fitted(rooms))
+    told, captured = measurement.that_set(rooms), [room for room in rooms if measurement.IDEAL not in room.scene]
+    found = measurement.document(told, measurement.left_out(captured, told), measurement.fitted(told))
     shipped = json.loads(FILE.read_text())
-    assert shipped["rooms"] == found["rooms"]
+    assert (shipped["rooms"], shipped["told_by"]) == (found["rooms"], found["told_by"])
     for part in ("errors", *(f"held.{name}" for name in found["held"])):
         section, _, name = part.partition(".")
         own, kept = (document[section][name] if name else document[section] for document in (found, shipped))

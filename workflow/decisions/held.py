@@ -17,16 +17,17 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 
 @lru_cache(None)
 def measured() -> dict[str, Any]:
-    """Return the document: `errors` (`iif_core.fitting.intervals.MeasuredErrors`), `rooms` from which they are, and of each
-    quantity in `held` the share of the objects whose truth an interval held that other rooms had made: the mean over rooms
-    (`pooled`), and the `lowest` and `highest`. Of roughness, objects with an interval of 0 to 1 do not count. `metals`: how
-    many objects were metal, and of how many of these the interval of metallic held that."""
+    """Return the document: `errors` (`iif_core.fitting.intervals.MeasuredErrors`), `told_by` the scenes from which they
+    are, and of each quantity in `held` the share of the objects whose truth an interval held that other rooms had made: the mean
+    over the `rooms` that were captured as they are (`pooled`), and the `lowest` and `highest`. Of roughness, objects with an
+    interval of 0 to 1 do not count. `metals`: how many objects were metal, and of how many of these the interval of metallic held
+    that."""
     return json.loads(FILE.read_text())
 
 
 def rooms() -> int:
-    """Return the number of rooms with truth from which the intervals are."""
-    return len(measured()["rooms"])
+    """Return the number of rooms with truth in which intervals were tested."""
+    return int(measured()["rooms"])
 
 
 def words(quantity: str) -> str:

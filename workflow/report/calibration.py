@@ -31,4 +31,4 @@ def words(light: str, level: str, meaning: str) -> str:
     counts = found["lights"][light][level]
     if level == "green":
         return f"Green means that {meaning}. It did in {counts['right']} of the {counts['of']} green ones of {made}."
-    return f"Of {made}, {counts['of']} were {level} here; {counts['right']} of these were as good as green promises."
+    return f"Green means that {meaning}. Of {made}, {counts['of']} were {level} here, and it did in {counts['right']} of them."

@@ -42,6 +42,11 @@ def evidence_of(scene: Reported) -> Evidence:
     def psnr(quantity: str) -> float | None:
         return found(means, quantity, "raw", "psnr").get("mean")
 
+    def over_all(quantity: str) -> float | None:
+        """PSNR of the mean square over the views: the mean of their PSNR is that of views which show no metal at all."""
+        square = found(means, quantity, "raw", "l2").get("mean")
+        return None if square is None else float(-10 * np.log10(max(square, 1e-12)))
+
     return Evidence(
         escape=escape.get("secondary"),
         escape_camera=escape.get("primary"),
@@ -62,8 +67,8 @@ def evidence_of(scene: Reported) -> Evidence:
         held_out_views=int(found(means, "rgb_held_out", "raw", "psnr").get("views", 0)),
         used=psnr("rgb"),
         albedo=psnr("albedo"),
-        roughness=psnr("roughness"),
-        metallic=psnr("metallic"),
+        roughness=over_all("roughness"),
+        metallic=over_all("metallic"),
         roughness_interval=roughness_interval(scene.objects),
         has_truth=capture.has_truth,
         prior=str(scene.prior.get("kind", "")),

@@ -35,9 +35,9 @@ def intervals_note() -> str:
     """Say what the intervals of the table are, and how often such intervals held."""
     shares, metals = [f"{name} of {held.words(name)}" for name in ("albedo", "roughness", "metallic")], held.measured()["metals"]
     return (
-        "In brackets the 95 % interval, for albedo of its brightest channel; roughness that no photograph shows has 0 to 1."
-        f" In {held.rooms()} rendered rooms with exact cameras and mesh such intervals held the {', '.join(shares[:2])}"
+        "In brackets the 95 % interval, for albedo of its brightest channel; 0 to 1 means that photographs do not tell it."
+        f" In {held.rooms()} rendered rooms with the errors of real captures such intervals held the {', '.join(shares[:2])}"
         f" and {shares[2]}"
-        " of the objects that they are claimed of. Few objects are metal, and metal is easily missed: of"
+        " of the objects that have one. Few objects are metal, and metal is easily missed: of"
         f" {metals['true']} metals the interval held {metals['held']}."
     )

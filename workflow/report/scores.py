@@ -52,6 +52,10 @@ HEADS = (
 """Scores at the head of the page: label, quantity, protocol, metric, and the limit of the verdict above which it is good."""
 
 
+WORSE = 0.1
+"""Decibels by which the result is worse than the fused predictions from which the page says so."""
+
+
 def found(means: Means, quantity: str, protocol: str, metric: str, variant: str = "result") -> dict[str, Any]:
     """Return mean and number of views of a score; empty where there is none."""
     return means.get(variant, {}).get(quantity, {}).get(protocol, {}).get(metric, {})
@@ -80,6 +84,9 @@ def headline(summary: Mapping[str, Any], has_lamps: bool, has_truth: bool) -> st
         text += f"; one flat colour per object, the mean of its predictions, reaches {plain['mean']:.1f} dB" if plain else ""
         taken = found(means, "albedo", "scaled", "psnr", "photo_as_albedo")
         text += f"; the mean photograph, taken for albedo, {taken['mean']:.1f} dB." if taken else "."
+        fused = found(means, "albedo", "scaled", "psnr", "base")
+        if fused and own["mean"] < fused["mean"] - WORSE:
+            text += f" The fit made it worse: the fused predictions that it starts from reach {fused['mean']:.1f} dB."
     if not has_lamps:
         text += " No lamp was found, so relighting has none to switch off."
     if gain is None and not has_truth:
@@ -122,7 +129,8 @@ def explain(quantity: str, protocol: str, metric: str) -> tuple[str, str, str]:
     what = {"rgb": "re-rendering of the photographs", "rgb_held_out": "re-rendering of held-out photographs"}.get(
         quantity, quantity
     )
-    against = "the photograph, in sensor values" if quantity.startswith("rgb") else "ground truth, pixel by pixel, linear"
+    seen = quantity.startswith("rgb") and metric not in ("log_l2", "light_spread")
+    against = "the photograph, in sensor values" if seen else "ground truth, pixel by pixel, linear"
     own = metric in ("shading_left", "shading_slope", "view_spread")
     measure = METRIC_WORDS.get(metric, METRICS[metric].label)
     words = (

@@ -390,29 +390,35 @@ def _light(e: Evidence) -> Light:
             lamps,
             _finding(
                 "misfit", e.misfit, "The light that was found explains how bright surfaces are to within {}",
-                "Look for lamps that are missing in the list below; photograph each lamp from several sides", ".0%",
+                "Look for lamps that are missing in the list below; photograph each lamp and window from several sides", ".0%",
                 shown=np.sqrt,
             ),
             _doubtful(e),
             _finding(
                 "light_spread", e.light_spread, "Against the truth, the error of the light varies by {} from object to object",
-                "Photograph each lamp from several sides", ".0%", shown=np.expm1,
+                "Photograph each lamp and window from several sides", ".0%", shown=np.expm1,
             ),
             *_warned(e, ("emission", "shading")),
         ],
     )  # fmt: skip
 
 
+_WORST_VIEWS = (
+    "Look at the worst views first: a wrong pose doubles edges, a missing lamp darkens what it lit,"
+    " a mirror is wrong inside its frame"
+)
+
+
 def _materials(e: Evidence) -> Light:
     if e.held_out is not None:
         scored = _finding(
             "rerendering", e.held_out, f"Re-renderings reach {{}} dB PSNR on {_counted(e.held_out_views, 'held-out photograph')}",
-            "Look at the worst views first: a wrong pose, a lamp that is missing and a mirror each look different", ".1f",
+            _WORST_VIEWS, ".1f",
         )  # fmt: skip
     else:
         scored = _finding(
             "rerendering", e.used, "Re-renderings reach {} dB PSNR on the photographs",
-            "Look at the worst views first: a wrong pose, a lamp that is missing and a mirror each look different", ".1f",
+            _WORST_VIEWS, ".1f",
         )  # fmt: skip
     judged = None
     if not e.has_truth and e.held_out is None:
@@ -434,7 +440,8 @@ def _materials(e: Evidence) -> Light:
         [
             scored,
             _finding(
-                "albedo", e.albedo, f"Albedo reaches {{}} dB PSNR against the truth{_off(e.albedo)}",
+                "albedo", e.albedo,
+                f"Albedo reaches {{}} dB PSNR against the truth, an error of about {_off(e.albedo or 0.0):.2f}",
                 "See which objects are off in the pictures 'albedo error'", ".1f",
             ),
             *_gloss(e),
@@ -449,7 +456,7 @@ def _materials(e: Evidence) -> Light:
                 "More photographs, or larger objects (segmentation)", ".0%",
             ),
             _finding(
-                "stability", e.stability, "Objects depend on the choice of photographs: stability {} of 1",
+                "stability", e.stability, "Objects stay the same when photographs are left out: {} of 1",
                 "Judge the pictures 'objects'; give object ids, or change segmentation.scale", ".2f", AMBER,
             ),
             *_warned(e, ("base", "affines")),
@@ -463,23 +470,24 @@ def _gloss(e: Evidence) -> list[Finding | None]:
     if e.has_truth:
         return [
             _finding(
-                "roughness", e.roughness, f"Roughness reaches {{}} dB PSNR against the truth{_off(e.roughness)}", remedy, ".1f",
+                "roughness", e.roughness, "Against the truth, roughness has a root mean square error of {}",
+                remedy, ".2f", shown=_off,
             ),
             _finding(
-                "metallic", e.metallic, f"Metallic reaches {{}} dB PSNR against the truth{_off(e.metallic)}",
-                remedy.replace("roughness", "metallic"), ".1f",
+                "metallic", e.metallic, "Against the truth, metallic has a root mean square error of {}",
+                remedy.replace("roughness", "metallic"), ".2f", shown=_off,
             ),
         ]  # fmt: skip
     if e.roughness_interval is None:
         return [Finding(GREEN, "Not judged: photographs show the roughness of less than 50 % of the surface")]
     known = f"Not judged: roughness is known to within ±{e.roughness_interval:.2f}"
     rooms = f"in {held.rooms()} rendered rooms, 95 % intervals of roughness held for {held.words('roughness')} of the objects"
-    return [Finding(GREEN, f"{known}; {rooms} that they are claimed of")]
+    return [Finding(GREEN, f"{known}; {rooms} that have one")]
 
 
-def _off(psnr: float | None) -> str:
-    """Describe the error that a PSNR against a range of 1 stands for."""
-    return f", an error of about {10 ** (-psnr / 20):.2f}" if psnr is not None and np.isfinite(psnr) else ""
+def _off(psnr: float) -> float:
+    """Return the root mean square error that a PSNR against a range of 1 stands for."""
+    return float(10 ** (-psnr / 20))
 
 
 def _counted(count: int, what: str) -> str:
@@ -504,7 +512,7 @@ def _scale(e: Evidence) -> Light:
         fixed = _finding(
             "level_error",
             e.level_error,
-            "The level of light and albedo is known to within {} (from indirect light)",
+            "The level of light and albedo is known from indirect light, with a typical error of {}",
             patch,
             ".0%",
         )
@@ -518,13 +526,14 @@ def _scale(e: Evidence) -> Light:
             _finding(
                 "raised", e.raised, "All light was raised by a factor of {}, so that albedos stay below 1",
                 "Light is missing: photograph every lamp and window and close the mesh, or fix the level by a white patch", ".2f",
-            ) if not e.raised <= 1 else Finding(GREEN, "Albedos stay below 1 without raising the light"),
+            ) if not e.raised <= 1 else Finding(GREEN, "No light had to be added to keep albedos below 1"),
             _finding(
                 "light_scale", moved, "The light that was found and the albedo that was predicted disagree by a factor of {}"
                 f" (the light was multiplied by {e.light_scale:.3g})", patch, ".2f",
             ) if e.level not in (*FIXED, "mean_albedo") else None,
             _finding(
-                "discrepancy", e.discrepancy, "Levels of single objects scatter by {} times their claimed variance",
+                "discrepancy", e.discrepancy,
+                "Photographs and predictions disagree on how bright objects are by {} times the variance that they claim",
                 "Look at objects whose uncertainty is large; lamps may be missing near them", ".2f",
             ),
         ],
