@@ -303,13 +303,31 @@ def test_light_on_a_ceiling_fades_and_a_lamp_in_it_does_not():
     assert not _fading(uneven, uneven >= 3, parts).any()
 
 
+@pytest.mark.parametrize("ratio, fades", [(1.4, True), (1.6, False)])
+def test_a_step_of_half_as_much_again_is_an_edge(ratio, fades):
+    parts = _ceiling()
+    lamp = np.linalg.norm(parts[0], axis=1) < 4
+    assert _fading(np.where(lamp, ratio, 1.0), lamp, parts)[lamp].all() == fades
+
+
+@pytest.mark.parametrize("share, fades", [(0.3, False), (0.6, True)])
+def test_half_of_the_border_decides_however_large_the_faces_around_are(share, fades):
+    at, areas, normals, adjacency = _ceiling()
+    lamp, angle = np.linalg.norm(at, axis=1) < 4, np.abs(np.arctan2(at[:, 1], at[:, 0])) / np.pi
+    brightness = np.where(lamp, 8.0, np.where(angle < share, 7.0, 1.0))
+    around = np.where(lamp, areas, 16 * areas)
+    assert _fading(brightness, lamp, (at, around, normals, adjacency))[lamp].all() == fades
+
+
 def test_light_around_a_saturated_lamp_fades_and_takes_the_lamp_not_along():
     parts = _ceiling()
     radius = np.linalg.norm(parts[0], axis=1)
     lamp = radius < 3
     seen = np.minimum(8 * np.exp(-0.5 * (radius / 7) ** 2), 7)  # the lamp is as bright as the bound, and so is what is next to it
-    found = _fading(seen, seen >= 3, parts, seen={"bounded": lamp, "clear": np.where(lamp, 0, 20).astype(np.int32)})
-    assert (found == (seen >= 3) & ~lamp).all()
+    hidden, mostly, half = {"bounded": lamp}, *({"clear": np.where(lamp, n, 20).astype(np.int32)} for n in (9, 10))
+    for says in (hidden, mostly, hidden | mostly):
+        assert (_fading(seen, seen >= 3, parts, seen=says) == (seen >= 3) & ~lamp).all()
+    assert _fading(seen, seen >= 3, parts, seen=half)[lamp].all()
     # Without the bounds, nothing tells the lamp from the light around it.
     assert _fading(seen, seen >= 3, parts)[lamp].all()
 

@@ -272,7 +272,7 @@ def fading_surface(
     smooth = told[a] & told[b] & flat & step
     # -------- patches of candidates that such edges join; a piece that glows is one patch --------
     inner = smooth & candidate[a] & candidate[b]
-    whole = np.flatnonzero(candidate & (glowing >= 0)) if glowing is not None else np.zeros(0, np.int64)
+    whole = np.flatnonzero(glowing >= 0) if glowing is not None else np.zeros(0, np.int64)
     piece = np.unique(glowing[whole], return_inverse=True)[1] if glowing is not None else whole
     size = n + int(piece.max(initial=-1)) + 1
     patch = component_labels(size, np.r_[a[inner], whole], np.r_[b[inner], n + piece])[:n]
