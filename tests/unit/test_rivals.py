@@ -110,14 +110,14 @@ def test_what_stands_behind_or_faces_away_is_not_seen():
 
 
 def test_the_rivals_are_seen_from_the_eye_of_the_held_out_view(seen, monkeypatch):
-    """As `by_others` from there, whatever number of pixels is predicted at once."""
+    """As `by_others` from there, whatever number of pixels is predicted at once; its own photograph is left out."""
     others = [shown(seen, np.full((*seen[i][1].shape, 3), float(i + 1)), i) for i in range(1, COUNT)]
     at, *surface = targets(seen, 0)
     monkeypatch.setattr(rivals, "BLOCK", 700)
     rival = object.__new__(rivals.OtherPhotographs)
     rival._normals = face_geometry(*own.room_mesh()[:2])[0]
-    rival._capture = SimpleNamespace(gbuffer=lambda view: seen[view.view_id][1:], used=range(COUNT - 1))
-    rival.shown, rival._developed = others.__getitem__, lambda view, radiance, photo, counted: radiance
+    rival._capture = SimpleNamespace(gbuffer=lambda view: seen[view.view_id][1:], used=[view for view, *_ in seen])
+    rival.shown, rival._developed = lambda view: [None, *others][view.view_id], lambda view, radiance, photo, counted: radiance
     photo = np.zeros((*seen[0][1].shape, 3))
     found = dict(rival.predictions(seen[0][0], photo, photo[..., 0] == 0))
     mean, blend, known = by_others(*surface, others)

@@ -251,7 +251,8 @@ def fading_surface(
     areas: np.ndarray,
     glowing: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Find candidates that fade into the surface around them, as light on a ceiling does and no lamp (Eq. L.65).
+    """Find candidates that fade into the surface around them, as light on a ceiling does and no lamp
+    (docs/method/light.md#emitter-candidates).
 
     Only unsaturated radiance tells: next to a lamp that saturates all photographs, surface is as bright as its bounds.
 
@@ -276,7 +277,7 @@ def fading_surface(
     piece = np.unique(glowing[whole], return_inverse=True)[1] if glowing is not None else whole
     size = n + int(piece.max(initial=-1)) + 1
     patch = component_labels(size, np.r_[a[inner], whole], np.r_[b[inner], n + piece])[:n]
-    # -------- of their border, what leads on to other surface: half of it is enough (Eq. L.65) --------
+    # -------- of their border, what leads on to other surface: half of it is enough --------
     border = smooth & (candidate[a] != candidate[b])
     owner = np.where(candidate[a], patch[a], patch[b])[border]
     length = np.bincount(owner, _EQUILATERAL * np.sqrt(np.minimum(areas[a], areas[b]))[border], size)
