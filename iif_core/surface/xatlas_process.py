@@ -49,10 +49,10 @@ def pack(meshes: Sequence[tuple[NDArray, NDArray]], padding: int, texels_per_uni
         RuntimeError: xatlas crashed in all of its tries, or said what is wrong.
     """
     for _ in range(_TRIES):
-        # By its path, because a child does not know where its parent found the package.
-        done = subprocess.run(
-            [sys.executable, __file__], input=pickle.dumps((list(meshes), padding, texels_per_unit)), capture_output=True
-        )
+        # By its path, because a child does not know where its parent found the package; -P keeps modules next to it from being
+        # taken for others of their name.
+        command = [sys.executable, "-P", __file__]
+        done = subprocess.run(command, input=pickle.dumps((list(meshes), padding, texels_per_unit)), capture_output=True)
         if done.returncode == 0:
             return Packed(**pickle.loads(done.stdout))
         if done.returncode > 0:  # an error of Python, which another try would meet again
