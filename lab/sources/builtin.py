@@ -6,12 +6,14 @@ The photographs are path traced with the workflow's own reflectance model and wi
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lab.sources.delivery import Delivered, Rendered, Renderings, Surface, deliver, effects, metered
+from lab.sources.footprint import Seen, over_pixels
 from lab.sources.rendered import RenderedWriter
 from workflow.scene.normal_form import Truth, View
 
@@ -114,9 +116,25 @@ class _Capture:
     def _render(self, view: View) -> tuple[Array, Array]:
         """Write G-buffer and truth; return the radiance (H, W, 3) and where it shows emitters (H, W)."""
         from iif_core.camera.pinhole import direction_derivatives
-        from iif_core.light.transport.geometry import trace
         from iif_core.light.transport.render import render
         from iif_core.light.transport.scene import PathOptions, Scene
+
+        depth, face, truth = over_pixels(view, self._look, self.scan.object_id)
+        rays = view.directions().reshape(-1, 3)
+        steps = direction_derivatives(view.fx, view.fy, view.world_from_camera)
+        seed = int(np.random.SeedSequence([self.job.seed, view.view_id]).generate_state(1)[0])
+        scene = Scene(self.geometry, self.material, self.emitters)
+        paths = PathOptions(self.renderings.samples, self.room.max_bounces, seed)
+        image = render(scene, view.world_from_camera[:3, 3], rays, paths, jitter=steps).reshape(truth.albedo.shape)
+        normal = np.where(face[..., None] >= 0, self.surface.normals[face], 0)
+        toward = -np.sign((normal * view.directions()).sum(-1, keepdims=True))
+        truth = replace(truth, radiance=self.renderings.denoised(image, truth.albedo, toward * normal))
+        self.writer.rendered(view.name, depth, face, truth, {})
+        return truth.radiance, truth.emission.any(-1)
+
+    def _look(self, view: View) -> Seen:
+        """Return z-depth, face ids and truth at the pixel centres; the radiance of the truth is still 0."""
+        from iif_core.light.transport.geometry import trace
 
         shape = (view.height, view.width)
         origin = view.world_from_camera[:3, 3]
@@ -126,26 +144,16 @@ class _Capture:
         depth = np.where(hit, depth, 0).astype(np.float32)
         on = np.maximum(face, 0)
         albedo, roughness, metallic = self.room.materials.numpy(origin + depth[:, None] * rays, self.scan.material_id[on])
-        cosine = (self.surface.normals[on] * rays).sum(1)
-        emission = np.where((hit & (cosine < 0))[:, None], self.scan.emission[on], 0)
-
-        steps = direction_derivatives(view.fx, view.fy, view.world_from_camera)
-        seed = int(np.random.SeedSequence([self.job.seed, view.view_id]).generate_state(1)[0])
-        scene = Scene(self.geometry, self.material, self.emitters)
-        paths = PathOptions(self.renderings.samples, self.room.max_bounces, seed)
-        image = render(scene, origin, rays, paths, jitter=steps)
-        normal = np.where(hit[:, None], -np.sign(cosine)[:, None] * self.surface.normals[on], 0)
-        image = self.renderings.denoised(*(a.reshape(*shape, 3) for a in (image, albedo, normal)))
+        front = (self.surface.normals[on] * rays).sum(1) < 0
         truth = Truth(
             np.where(hit[:, None], albedo, 0).reshape(*shape, 3),
             np.where(hit, roughness, 0).reshape(shape),
             np.where(hit, metallic, 0).reshape(shape),
-            emission.reshape(*shape, 3),
-            image,
+            np.where((hit & front)[:, None], self.scan.emission[on], 0).reshape(*shape, 3),
+            np.zeros((*shape, 3), np.float32),
             hit.reshape(shape),
         )
-        self.writer.rendered(view.name, depth.reshape(shape), face.reshape(shape), truth, {})
-        return truth.radiance, truth.emission.any(-1)
+        return Seen(depth.reshape(shape), face.reshape(shape), truth)
 
     def _finish(self, views: list[View], found: Delivered, scan: Scan) -> None:
         from lab.rooms.coverage import seen_from, surface_points

@@ -17,6 +17,7 @@ import numpy as np
 from iif_core.errors import InputError
 from lab.mitsuba_scene.document import referenced_files
 from lab.sources.delivery import Delivered, Rendered, Renderings, Surface, deliver, effects, metered
+from lab.sources.footprint import Seen, over_pixels
 from lab.sources.rendered import RenderedWriter
 from workflow.intake.meshes import check_mesh
 from workflow.intake.pictures import check_texture
@@ -223,7 +224,7 @@ class _Capture:
         needed of it: the number of samples that were dropped and the pixels without any."""
         from lab.mitsuba_scene import render
 
-        depth, face, truth = self._gbuffer(view)
+        depth, face, truth = over_pixels(view, self._look, self.mesh.shape)
         samples = self.renderings.samples
         image, valid, dropped = render.render_view(self.loaded.scene, integrator, view, samples, self.job.seed)
         image = self.renderings.denoised(image, truth.albedo, self._normals(view, face))
@@ -231,8 +232,8 @@ class _Capture:
         self.writer.rendered(view.name, depth, face, replace(truth, radiance=image), facts)
         return image, truth.emission.any(-1), facts
 
-    def _gbuffer(self, view: View) -> tuple[Array, Array, Truth]:
-        """Return z-depth, face ids and material truth at the pixel centres; the radiance of the truth is still 0."""
+    def _look(self, view: View) -> Seen:
+        """Return z-depth, face ids and truth at the pixel centres; the radiance of the truth is still 0."""
         from iif_core.light.transport.geometry import trace
         from lab.mitsuba_scene import materials, render
 
@@ -267,7 +268,7 @@ class _Capture:
             raster(surface.truth & undisturbed & (front | two_sided)),
         )
         shape = (view.height, view.width)
-        return np.where(face >= 0, t, 0).reshape(shape).astype(np.float32), face.reshape(shape), truth
+        return Seen(np.where(face >= 0, t, 0).reshape(shape).astype(np.float32), face.reshape(shape), truth)
 
     def _scanned(self, instance: Array, views: list[View]) -> Scanned:
         """Return the mesh as a scan of it would be."""
