@@ -148,7 +148,7 @@ def _room(strip, reflects=0.1, seed=3):
     hidden = np.array([False, False, True, True])
     white = WhiteSurface(np.zeros((4, 3)), np.zeros((4, 4, 3)), np.full((4, 3), reflects))
     base = guess[:, None] * np.ones(3)
-    return Candidates(problem.beside(anchors), reflecting, own, prior, np.arange(4), hidden, shown, white, BaseAlbedo(base))
+    return Candidates(problem.beside(anchors), reflecting, own, prior, np.arange(4), hidden, shown, white, BaseAlbedo(base), 2.0)
 
 
 def _growth(candidates, *chosen, doubtful=()):
@@ -171,6 +171,27 @@ def test_surface_no_brighter_than_white_may_be_taken_out_though_the_misfit_grows
     twice = replace(dim.reflecting, rows=replace(dim.reflecting.rows, observed=2 * dim.reflecting.rows.observed))
     assert _growth(replace(dim, reflecting=twice), 0, 1, 2).get(frozenset({0, 2}), 0.0) < 1.0
     assert lamp not in _growth(dim, 0)  # nothing else would shine
+
+
+def test_surface_that_nothing_else_makes_so_bright_stays():
+    """The patch shows 0.8 of what a white one would under lamp and strip, and then four times as much."""
+    room = _room(1.0)
+    four = replace(room.reflecting, rows=replace(room.reflecting.rows, observed=4 * room.reflecting.rows.observed))
+    dim, bright = (
+        [p.families for p in one.proposals(frozenset({0, 1, 2}), frozenset({1}))]
+        for one in (room, replace(room, reflecting=four))
+    )
+    assert {0, 2} in dim and not any(1 not in families for families in bright)
+
+
+def test_what_cannot_go_alone_is_not_compared_with_nothing_in_its_place():
+    every, alone, swapped = frozenset({0, 1}), frozenset({0}), frozenset({0, 2})
+    values = {every: 1.0, alone: 0.01, swapped: 0.5}
+
+    def chosen(**kind):
+        return search(every, lambda now: [Proposal(swapped, **kind)] if now == every else [], values.__getitem__)[0]
+
+    assert chosen() == alone and chosen(alone=False) == swapped
 
 
 def test_saturated_surface_is_judged_by_a_trace_of_its_own():

@@ -196,7 +196,7 @@ def search_emitters(
         return misfits[chosen]
 
     start = frozenset(family[: groups.size][lit].tolist())
-    look = _first_look(photos, unseen, every, lit, family, sky, threshold)
+    look = _first_look(photos, unseen, every, lit, family, sky, threshold, certain)
     brightest = {f: float(excess[family[: groups.size] == f].max()) for f in start}
     given = {f: float(power[family[: groups.size] == f].max()) for f in start}
     suspects = sorted((f for f, value in brightest.items() if value < certain), key=lambda f: -given[f])[:SUSPECTS]
@@ -286,6 +286,7 @@ def _first_look(
     family: np.ndarray,
     sky: Sky | None,
     threshold: float,
+    certain: float,
 ) -> Candidates:
     """Trace all groups as columns of one problem, on some of the rows; of the first groups some are `lit`."""
     thin = -(-photos.options.rows // FIRST_LOOK_ROWS)
@@ -301,7 +302,7 @@ def _first_look(
     hidden = np.r_[every.is_hidden, np.zeros(outside, bool)]
     shown = np.concatenate([seen, np.zeros((outside, 3))])
     of_all = np.r_[family, np.full(outside, -1)]
-    return Candidates(problem, reflecting, of_group, prior, of_all, hidden, shown, white, base_albedo(photos, sky))
+    return Candidates(problem, reflecting, of_group, prior, of_all, hidden, shown, white, base_albedo(photos, sky), certain)
 
 
 def _white_hidden_surface(

@@ -42,11 +42,13 @@ class Proposal(NamedTuple):
         families: that shine.
         largest_growth: factor by which the misfit of the present ones may change for these to take their place.
         always: they are traced, whatever the first look says of them.
+        alone: of these, the families that shine already may also do so with nothing in the place of those that go.
     """
 
     families: Families
     largest_growth: float = 1.0 - STEP
     always: bool = False
+    alone: bool = True
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class Candidates:
         shown: (G, 3) radiance with which a group lights the scene that only reflects.
         white: what a white surface would show in the place of hidden groups.
         albedo: of the base.
+        certain: brightness relative to a white surface from which a family shines for certain.
     """
 
     problem: EmissionProblem
@@ -73,32 +76,37 @@ class Candidates:
     shown: np.ndarray
     white: WhiteSurface
     albedo: BaseAlbedo
+    certain: float
 
     def proposals(self, chosen: Families, doubtful: Families = frozenset(), suspects: Families = frozenset()) -> list[Proposal]:
         """Return sets of families that may explain the photographs better than `chosen`, the most promising first.
 
         Families are taken out, added, or put in the place of one of the chosen; added ones in the order of what their light alone
         would take off the misfit. Families that are `doubtful` are taken out if the misfit does not grow, and those that are no
-        brighter than a white surface in their place unless it grows by half. `suspects` may only seem to shine because the light
-        of others was given to them; the first look is wrong while they do, so what could take their place is always traced.
+        brighter than a white surface in their place unless it grows by half. Families `certain` times as bright as a white surface
+        stay. `suspects` may only seem to shine because the light of others was given to them; the first look is wrong while they
+        do, so what could take their place is always traced.
         """
         misfit, lit, _ = self._look(chosen)
         found: dict[Families, float] = {}
         largest: dict[Families, tuple[float, float]] = {}  # growth of the misfit, in this look and in a separate trace
         always: set[Families] = set()
+        impossible: set[Families] = set()
 
-        def with_added(families: Families, value: float, lit: EmissionProblem, most: int) -> None:
+        def with_added(families: Families, value: float, lit: EmissionProblem, most: int, out: int | None = None) -> None:
             for f in self._best_added(families, lit, NOTICEABLE * misfit)[:most]:
-                added = self._look(families | {f})[0]
-                if added <= (1.0 - PROMISING) * value:
+                added, _, white = self._look(families | {f})
+                stays = out is not None and self._excess(out, white) >= self.certain
+                if added <= (1.0 - PROMISING) * value and not stays:
                     found[families | {f}] = added
 
         with_added(chosen, misfit, lit, _ADDED)
         for out in sorted(chosen):
             rest = chosen - {out}
             found[rest], lit, white = self._look(rest)
+            excess = self._excess(out, white) if rest else np.inf
             if found[rest] <= _MISSED * misfit:
-                with_added(rest, found[rest], lit, _SWAPPED)
+                with_added(rest, found[rest], lit, _SWAPPED, out)
             if out in suspects:
                 instead = {rest | {f} for f in self._best_added(rest, lit, NOTICEABLE * misfit)[:_SWAPPED]}
                 found |= {families: self._look(families)[0] for families in instead - set(found)}
@@ -106,12 +114,13 @@ class Candidates:
             # Fewer families are worth a trace of their own if they explain nearly as much. How bright saturated surface is that
             # only reflects is not known before that trace.
             look = _MISSED if self._is_saturated(out) else 1.0 + PROMISING
-            reflects = bool(rest) and self._excess(out, white) < 1.0
-            largest[rest] = look, _MISSED if reflects else 1.0 if out in doubtful else 1.0 - STEP
-        order = sorted(found, key=lambda f: found[f] * (1.0 + PROMISING) ** len(f))
+            largest[rest] = look, _MISSED if excess < 1.0 else 1.0 if out in doubtful else 1.0 - STEP
+            if rest and excess >= self.certain:  # nothing that is left makes it so bright
+                impossible.add(rest)
+        order = sorted(found.keys() - impossible, key=lambda f: (found[f] * (1.0 + PROMISING) ** len(f), sorted(f)))
         growth = {families: largest.get(families, (1.0 - PROMISING, 1.0 - STEP)) for families in order}
         worth = (f for f in order if f in always or found[f] <= growth[f][0] * misfit)
-        return [Proposal(f, growth[f][1], f in always) for f in worth]
+        return [Proposal(f, growth[f][1], f in always, f & chosen not in impossible) for f in worth]
 
     def _look(self, chosen: Families) -> tuple[float, EmissionProblem, np.ndarray]:
         """Misfit of the families; the problem with all columns, scaled by the gains, in which their light is cached; and (n, 3)
@@ -212,7 +221,7 @@ def search(
         tried = [proposal for place, proposal in enumerate(possible) if place < _CONFIRMED or proposal.always]
         # What takes the place of a family is compared with nothing in its place.
         known = {proposal.families for proposal in tried}
-        rest = {p.families & chosen for p in tried if not p.families >= chosen} - known
+        rest = {p.families & chosen for p in tried if p.alone and not p.families >= chosen} - known
         tried += [Proposal(families) for families in sorted(rest, key=sorted)]
         if not tried:
             break
