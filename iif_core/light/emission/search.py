@@ -83,7 +83,7 @@ class Candidates:
 
         Families are taken out, added, or put in the place of one of the chosen; added ones in the order of what their light alone
         would take off the misfit. Families that are `doubtful` are taken out if the misfit does not grow, and those that are no
-        brighter than a white surface in their place unless it grows by half. Families `certain` times as bright as a white surface
+        brighter than a white surface in their place unless it grows by half. Families that are `certain` times as bright as one
         stay. `suspects` may only seem to shine because the light of others was given to them; the first look is wrong while they
         do, so what could take their place is always traced.
         """
