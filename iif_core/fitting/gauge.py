@@ -70,6 +70,20 @@ def apply_gauge(problem: FitProblem, fit: FitResult, gauge: Gauge) -> FitResult:
     return replace(fit, affine=affine, covariance=covariance, light_scale=fit.light_scale * factor, facts=facts)
 
 
+def kept_brightness(before: np.ndarray, after: np.ndarray) -> float:
+    """Return the factor on all light with which a room is as bright after a gauge as it was before (Eq. M.42).
+
+    Args:
+        before, after: (n, 3) radiance of the same pixels.
+
+    Returns:
+        exp median ln (before / after) over the pixels that are lit in both; 1.0 without such pixels.
+    """
+    old, new = before.mean(1, dtype=np.float64), after.mean(1, dtype=np.float64)
+    lit = (old > 0) & (new > 0) & np.isfinite(old) & np.isfinite(new)
+    return float(np.exp(np.median(np.log(old[lit] / new[lit])))) if lit.any() else 1.0
+
+
 def _weigh_levels(problem: FitProblem, fit: FitResult, error: float, prior_error: float) -> tuple[float, float]:
     """Return factor and error of the weighted mean of found level and prior's level (Eq. M.43)."""
     if error <= 0:

@@ -7,7 +7,7 @@ from iif_core.camera.response import response
 from iif_core.errors import InputError
 from iif_core.fitting.descent import GaussianPrior
 from iif_core.fitting.direct import fit_affines
-from iif_core.fitting.gauge import Gauge, apply_gauge
+from iif_core.fitting.gauge import Gauge, apply_gauge, kept_brightness
 from iif_core.fitting.levels import interpolate_levels
 from iif_core.fitting.pixels import evaluate, prepare_pixels, run_in_threads
 from iif_core.fitting.problem import FitOptions, FitProblem, albedo_uncertainty
@@ -511,3 +511,11 @@ def test_without_metals_every_object_is_a_dielectric():
     none = fit_affines(problem, response("identity"), FitOptions(metals=False))
     assert (none.affine[:, 14:] == 0).all() and np.isfinite(none.affine).all()
     assert none.free[:, :14].sum() == metals.free[:, :14].sum()
+
+
+def test_brightness_that_is_kept_is_the_median_of_what_is_lit():
+    before = np.array([[1.0, 2.0, 3.0], [4.0, 4.0, 4.0], [9.0, 0.0, 0.0], [0.0, 0.0, 0.0], [5.0, 5.0, 5.0]])
+    after = np.array([[0.5, 1.0, 1.5], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
+    assert kept_brightness(before, after) == pytest.approx(3.0)
+    assert kept_brightness(before[3:], after[3:]) == kept_brightness(before[:0], after[:0]) == 1.0
+    assert kept_brightness(np.float32([[1e-30] * 3]), np.float32([[1e30] * 3])) == pytest.approx(1e-60)

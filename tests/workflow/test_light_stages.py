@@ -18,6 +18,7 @@ from workflow.scene import emission_views
 from workflow.scene.base_scene import read_base_scene
 from workflow.scene.cached_light import read_diffuse, read_specular
 from workflow.scene.normal_form import CaptureReader
+from workflow.scene.recovered import read_recovered
 from workflow.stages import affines, emission, plan, shading
 
 TRUE = np.array([[LAMP, 0.95 * LAMP, 0.85 * LAMP], [BULB, 0.8 * BULB, 0.6 * BULB]])
@@ -300,6 +301,35 @@ def test_known_scale_of_a_lamp_and_of_a_patch(hdr):
     with refused("box"):
         gauge(white_patch=SimpleNamespace(object=None, view="v000", box=(0, 0, 400, 4), albedo=0.9))
     assert len(free["name"]) == len(room.names)
+
+
+@pytest.mark.parametrize("mean", [0.25, 0.75])
+def test_another_level_of_the_albedos_leaves_the_room_as_bright(hdr, tmp_path, mean):
+    """Light that was reflected falls with the albedos, so a lamp has to make up for more than it lost at its first bounce."""
+    from iif_core.light.transport.render import render
+    from iif_core.light.transport.scene import PathOptions, Scene
+
+    folder, _ = hdr
+    for stage in ("capture", "prior", "segmentation", "base", "emission", "shading", "second_look"):
+        shutil.copytree(folder / stage, tmp_path / stage)
+    settings = {"capture": {"dynamic_range": "hdr"}, "emission": EMISSION, "shading": SHADING}
+    run(tmp_path, {"affines": affines}, **settings, affines={**AFFINES, "scale": {"mean_albedo": mean}})
+    facts = opened(tmp_path, "affines").json("affines.json")
+    light = facts["light_scale"] / facts["scale"]["factor"]
+    assert light == pytest.approx(facts["interreflection"])
+    assert opened(folder, "affines").json("affines.json")["interreflection"] == pytest.approx(1, abs=0.01)
+
+    def shown(of_folder):
+        capture, scene = CaptureReader(opened(folder, "capture")), read_recovered(of(of_folder, **settings).job("render"))
+        geometry, material = scene.surface.traceable(scene.light.emits)
+        world, out = Scene(geometry, material, scene.light.emitters(geometry)), []
+        for view in capture.views:
+            rays = view.directions().reshape(-1, 3)[~scene.light.emits[capture.gbuffer(view)[1].ravel()]]
+            out.append(render(world, view.world_from_camera[:3, 3], rays, PathOptions(32, 16, 7)).mean(1))
+        return np.concatenate(out)
+
+    assert np.median(shown(tmp_path) / shown(folder)) == pytest.approx(1, abs=0.02)
+    assert abs(np.log(light)) > 0.1  # without it the room would be darker or brighter by that
 
 
 PLANNED = {

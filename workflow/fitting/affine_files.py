@@ -20,8 +20,8 @@ from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import write_response
 
 
-def write_fit(job: Job, inputs: FitInputs, fit: FitResult, solver: str) -> None:
-    """Write the artefacts of stage affines; `solver`: the name of what fitted."""
+def write_fit(job: Job, inputs: FitInputs, fit: FitResult, solver: str, interreflection: float = 1.0) -> None:
+    """Write the artefacts of stage affines; `solver`: the name of what fitted; `interreflection`: see there."""
     names, capture, given = inputs.names, inputs.capture, inputs.problem.given
     for o, name in enumerate(names):
         job.log.debug("%s: %s, residual %.4f", name, fit.model[o], fit.residual[o])
@@ -34,11 +34,11 @@ def write_fit(job: Job, inputs: FitInputs, fit: FitResult, solver: str) -> None:
     plan = _plan_of_fit(inputs.problem, fit, inputs.calibration, capture.facts["dynamic_range"], job.settings.components.metallic)
     if given is not None:
         plan.append(materials.given_by_hand(names, given))
-    _write_facts(job, solver, fit, plan)
+    _write_facts(job, solver, fit, plan, interreflection)
 
 
-def _write_facts(job: Job, solver: str, fit: FitResult, plan: list[Decision]) -> None:
-    """Write affines.json; `solver`: the name of what fitted."""
+def _write_facts(job: Job, solver: str, fit: FitResult, plan: list[Decision], interreflection: float) -> None:
+    """Write affines.json."""
     spread = np.sqrt(np.clip(np.diagonal(fit.response_covariance), 0.0, None))
     weight = np.maximum(fit.pixels, 1e-9)
     facts = dict(fit.facts)
@@ -46,7 +46,8 @@ def _write_facts(job: Job, solver: str, fit: FitResult, plan: list[Decision]) ->
         "affines.json",
         {
             "solver": solver,
-            "light_scale": float(fit.light_scale),
+            "light_scale": float(fit.light_scale * interreflection),
+            "interreflection": interreflection,
             "numerics": numerics.of_affines(facts.pop("numerics", {}), bool(fit.converged)),
             **facts,
             "history": [float(x) for x in fit.history],

@@ -48,5 +48,5 @@ def emitter_note(is_hdr: bool, light_scale: float) -> str:
     if not is_hdr:
         text += " With LDR photographs the factor between light and albedo is `affines.scale`."
     if light_scale != 1:
-        text += f" The fit multiplied all light by {light_scale:.3g} and divided the albedos by as much."
+        text += f" The fit multiplied all light by {light_scale:.3g}, so that it goes with the level of the albedos."
     return text

@@ -77,7 +77,7 @@ def evidence_of(scene: Reported) -> Evidence:
         level=str(scale.get("kind", "")),
         level_error=scale.get("relative_error"),
         raised=float(np.exp(emission.get("level_raised") or 0.0)),
-        light_scale=recovered.light_scale,
+        light_scale=float(scale.get("factor", 1.0)),
         discrepancy=(affines.get("level_errors") or {}).get("normalised_discrepancy"),
         warnings=[(stage, says) for stage in NUMERICS for says in numerics.warnings([(stage, scene.document(stage))])],
     )

@@ -13,6 +13,7 @@ from iif_core.fitting.problem import FitOptions, FitProblem, FitResult
 from workflow.fitting.affine_files import write_fit
 from workflow.fitting.fit_input import Draw, read_fit
 from workflow.fitting.inputs import prediction_errors
+from workflow.fitting.interreflection import interreflection
 from workflow.runtime.job import Job
 from workflow.scene.cached_light import has_lobes
 from workflow.settings.options import options_of
@@ -43,7 +44,10 @@ def fit(
     inputs = read_fit(job, draw, merged)
     with job.timed("solve"):
         free = solver(job, inputs.prior)(inputs.problem, inputs.start)
-    write_fit(job, inputs, apply_gauge(inputs.problem, free, inputs.gauge), name)
+    found = apply_gauge(inputs.problem, free, inputs.gauge)
+    with job.timed("interreflection"):
+        kept = interreflection(job, inputs, free, found)
+    write_fit(job, inputs, found, name, kept)
 
 
 def _direct(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Solver:
