@@ -173,15 +173,30 @@ def test_surface_no_brighter_than_white_may_be_taken_out_though_the_misfit_grows
     assert lamp not in _growth(dim, 0)  # nothing else would shine
 
 
+def _alone(candidates, *chosen, certain):
+    """Families that are proposed in place of the chosen ones -> whether they may also shine with nothing in the place of others."""
+    found = replace(candidates, certain=certain).proposals(frozenset(chosen), frozenset({1}))
+    return {proposal.families: proposal.alone for proposal in found}
+
+
 def test_surface_that_nothing_else_makes_so_bright_stays():
-    """The patch shows 0.8 of what a white one would under lamp and strip, and then four times as much."""
+    """The patch shows 0.88 of what a white one would under lamp and strip, and 10.4 times that of the lamp alone."""
+    room, lamp_and_strip = _room(1.0), frozenset({0, 2})
+    assert lamp_and_strip in _alone(room, 0, 1, 2, certain=0.9) and lamp_and_strip not in _alone(room, 0, 1, 2, certain=0.8)
+    # In the place of the patch the strip may shine, which lights it well enough; the lamp alone does not.
+    assert _alone(room, 0, 1, certain=10.0)[lamp_and_strip] is False and _alone(room, 0, 1, certain=11.0)[lamp_and_strip] is True
+    assert lamp_and_strip not in _alone(room, 0, 1, certain=0.8)
+
+
+def test_what_no_camera_sees_may_go_again():
+    """Nothing says how bright the strip and the wrong surface would look, so that they are no lamps for certain."""
+    assert {frozenset({0, 2}), frozenset({0})} <= _alone(_room(1.0), 0, 3, certain=0.1).keys()
+
+
+def test_the_only_family_stays_where_light_from_outside_does_not_make_it_so_bright():
     room = _room(1.0)
-    four = replace(room.reflecting, rows=replace(room.reflecting.rows, observed=4 * room.reflecting.rows.observed))
-    dim, bright = (
-        [p.families for p in one.proposals(frozenset({0, 1, 2}), frozenset({1}))]
-        for one in (room, replace(room, reflecting=four))
-    )
-    assert {0, 2} in dim and not any(1 not in families for families in bright)
+    outside = replace(room, family=np.array([-1, 0, 1, 2]))  # the light of the lamp comes from outside
+    assert [_alone(outside, 0, certain=certain)[frozenset({1})] for certain in (10.0, 11.0)] == [False, True]
 
 
 def test_what_cannot_go_alone_is_not_compared_with_nothing_in_its_place():

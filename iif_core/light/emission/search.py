@@ -85,7 +85,7 @@ class Candidates:
         would take off the misfit. Families that are `doubtful` are taken out if the misfit does not grow, and those that are no
         brighter than a white surface in their place unless it grows by half. Families that are `certain` times as bright as one
         stay. `suspects` may only seem to shine because the light of others was given to them; the first look is wrong while they
-        do, so what could take their place is always traced.
+        do, so what could take their place is always traced, however bright they are.
         """
         misfit, lit, _ = self._look(chosen)
         found: dict[Families, float] = {}
@@ -96,15 +96,13 @@ class Candidates:
         def with_added(families: Families, value: float, lit: EmissionProblem, most: int, out: int | None = None) -> None:
             for f in self._best_added(families, lit, NOTICEABLE * misfit)[:most]:
                 added, _, white = self._look(families | {f})
-                stays = out is not None and self._excess(out, white) >= self.certain
-                if added <= (1.0 - PROMISING) * value and not stays:
+                if added <= (1.0 - PROMISING) * value and not (out is not None and self._must_shine(out, white)):
                     found[families | {f}] = added
 
         with_added(chosen, misfit, lit, _ADDED)
         for out in sorted(chosen):
             rest = chosen - {out}
             found[rest], lit, white = self._look(rest)
-            excess = self._excess(out, white) if rest else np.inf
             if found[rest] <= _MISSED * misfit:
                 with_added(rest, found[rest], lit, _SWAPPED, out)
             if out in suspects:
@@ -114,8 +112,9 @@ class Candidates:
             # Fewer families are worth a trace of their own if they explain nearly as much. How bright saturated surface is that
             # only reflects is not known before that trace.
             look = _MISSED if self._is_saturated(out) else 1.0 + PROMISING
-            largest[rest] = look, _MISSED if excess < 1.0 else 1.0 if out in doubtful else 1.0 - STEP
-            if rest and excess >= self.certain:  # nothing that is left makes it so bright
+            reflects = bool(rest) and self._excess(out, white) < 1.0
+            largest[rest] = look, _MISSED if reflects else 1.0 if out in doubtful else 1.0 - STEP
+            if (rest or (self.family < 0).any()) and self._must_shine(out, white):
                 impossible.add(rest)
         order = sorted(found.keys() - impossible, key=lambda f: (found[f] * (1.0 + PROMISING) ** len(f), sorted(f)))
         growth = {families: largest.get(families, (1.0 - PROMISING, 1.0 - STEP)) for families in order}
@@ -150,6 +149,11 @@ class Candidates:
         own = np.isin(self.of_group, np.flatnonzero(self.family == family))
         weight = self.reflecting.pixels[own] @ white[own].sum(1)
         return float(self.reflecting.pixels[own] @ self.reflecting.rows.observed[own].sum(1) / weight) if weight > 0 else np.inf
+
+    def _must_shine(self, family: int, white: np.ndarray) -> bool:
+        """A family was seen, and no light that falls on it could make `white` surface nearly as bright."""
+        seen = bool(np.isin(self.of_group, np.flatnonzero(self.family == family)).any())
+        return seen and self._excess(family, white) >= self.certain
 
     def _is_saturated(self, family: int) -> bool:
         """Most of what was seen of a family is a lower bound."""
