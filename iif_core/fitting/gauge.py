@@ -61,8 +61,7 @@ def apply_gauge(problem: FitProblem, fit: FitResult, gauge: Gauge) -> FitResult:
     facts: dict[str, Any] = {**fit.facts, "scale": {"kind": gauge.kind, "factor": factor, "relative_error": error}}
     if factor == 1.0:
         return replace(fit, facts=facts)
-    # Objects that were not fitted keep their base, which is in the gauge of the prior already.
-    fitted = ~np.array([model.startswith("identity") for model in fit.model], bool)
+    fitted = is_divided(fit)
     affine, covariance = fit.affine.copy(), fit.covariance.copy()
     affine[fitted, :12] /= factor
     covariance[:, :12, :] /= factor
@@ -70,8 +69,14 @@ def apply_gauge(problem: FitProblem, fit: FitResult, gauge: Gauge) -> FitResult:
     return replace(fit, affine=affine, covariance=covariance, light_scale=fit.light_scale * factor, facts=facts)
 
 
+def is_divided(fit: FitResult) -> np.ndarray:
+    """Return (O,) bool: the gauge divides the albedo of the object. One that was not fitted keeps its base, which is in the gauge
+    of the prior already."""
+    return ~np.array([model.startswith("identity") for model in fit.model], bool)
+
+
 def kept_brightness(before: np.ndarray, after: np.ndarray) -> float:
-    """Return the factor on all light with which a room is as bright after a gauge as it was before (Eq. M.42).
+    """Return the factor on all light with which a room is as bright after a gauge as it was before.
 
     Args:
         before, after: (n, 3) radiance of the same pixels.

@@ -1,5 +1,7 @@
 from dataclasses import replace
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from iif_core.camera.response import response
 from iif_core.errors import InputError
 from iif_core.fitting.descent import GaussianPrior
 from iif_core.fitting.direct import fit_affines
-from iif_core.fitting.gauge import Gauge, apply_gauge, kept_brightness
+from iif_core.fitting.gauge import Gauge, apply_gauge, is_divided, kept_brightness
 from iif_core.fitting.levels import interpolate_levels
 from iif_core.fitting.pixels import evaluate, prepare_pixels, run_in_threads
 from iif_core.fitting.problem import FitOptions, FitProblem, albedo_uncertainty
@@ -519,3 +521,8 @@ def test_brightness_that_is_kept_is_the_median_of_what_is_lit():
     assert kept_brightness(before, after) == pytest.approx(3.0)
     assert kept_brightness(before[3:], after[3:]) == kept_brightness(before[:0], after[:0]) == 1.0
     assert kept_brightness(np.float32([[1e-30] * 3]), np.float32([[1e30] * 3])) == pytest.approx(1e-60)
+
+
+def test_objects_that_keep_their_base_are_not_divided():
+    fit = SimpleNamespace(model=["diag, dielectric", "identity (3 pixels)", "population (12 pixels)"])
+    assert is_divided(fit).tolist() == [True, False, True]

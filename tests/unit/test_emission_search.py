@@ -174,7 +174,7 @@ def test_surface_no_brighter_than_white_may_be_taken_out_though_the_misfit_grows
 
 
 def _alone(candidates, *chosen, certain):
-    """Families that are proposed in place of the chosen ones -> whether they may also shine with nothing in the place of others."""
+    """Families proposed in place of the chosen ones -> whether they may also shine with nothing in the place of others."""
     found = replace(candidates, certain=certain).proposals(frozenset(chosen), frozenset({1}))
     return {proposal.families: proposal.alone for proposal in found}
 

@@ -44,6 +44,11 @@ def test_texture_finer_than_a_pixel_has_its_mean():
     np.testing.assert_array_equal(found.face, centre.face)
 
 
+def test_all_sixteen_points_count():
+    found = over_pixels(VIEW, look(lambda x, y: ((4 * x).astype(int) % 4 + 1) * ((4 * y).astype(int) % 4 + 2.0)), np.zeros(1, int))
+    np.testing.assert_allclose(found.truth.roughness, 2.5 * 3.5, rtol=1e-12)  # along a diagonal it would be 10
+
+
 def test_a_gradient_has_the_value_of_the_centre():
     found = over_pixels(VIEW, look(lambda x, y: 0.1 + 0.03 * x + 0.05 * y), np.zeros(1, int))
     x, y = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5)
@@ -71,12 +76,15 @@ def test_points_without_truth_do_not_count_and_pixels_without_keep_the_centre():
     found = over_pixels(VIEW, half, np.zeros(1, int)).truth
     np.testing.assert_array_equal(found.valid, half(VIEW).truth.valid)
     np.testing.assert_allclose(found.roughness[1:], 0.3)
+    beside = look(colour, lambda x, y: (y > 1) & (x % 1 < 0.4))  # the centres have no truth, points beside them have
+    np.testing.assert_array_equal(over_pixels(VIEW, beside, np.zeros(1, int)).truth.roughness, beside(VIEW).truth.roughness)
     nothing = over_pixels(VIEW, look(stripes, known=lambda x, y: np.zeros_like(x, bool)), np.zeros(1, int)).truth
     np.testing.assert_array_equal(nothing.albedo, look(stripes)(VIEW).truth.albedo)
 
 
 def test_where_nothing_is_there_is_nothing():
     sky = look(lambda x, y: 0.4 + 0 * x, face=lambda x, y: np.where(y < 3.1, -1, 0))
-    found = over_pixels(VIEW, sky, np.zeros(1, int)).truth
-    assert not found.albedo[:3].any()
-    np.testing.assert_allclose(found.roughness[3:], 0.4)
+    for owner in (np.zeros(1, int), np.array([0, -1])):
+        found = over_pixels(VIEW, sky, owner).truth
+        assert not found.albedo[:3].any()
+        np.testing.assert_allclose(found.roughness[3:], 0.4)

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, Room, build, of, opened, run, write_plan
 
+from iif_core.reflectance.material import IDENTITY
 from lab.simulated.photographs import response_curve
 from tests.errors import refused
 from workflow.artifacts import files
-from workflow.fitting import asked
+from workflow.fitting import asked, interreflection
 from workflow.scene import emission_views
 from workflow.scene.base_scene import read_base_scene
 from workflow.scene.cached_light import read_diffuse, read_specular
@@ -330,6 +331,25 @@ def test_another_level_of_the_albedos_leaves_the_room_as_bright(hdr, tmp_path, m
 
     assert np.median(shown(tmp_path) / shown(folder)) == pytest.approx(1, abs=0.02)
     assert abs(np.log(light)) > 0.1  # without it the room would be darker or brighter by that
+
+
+def test_brightness_is_compared_where_albedos_were_divided_and_possible(hdr, llvm):
+    from iif_core.light.transport.geometry import build_geometry, trace
+
+    folder, room = hdr
+    job = of(folder, capture={"dynamic_range": "hdr"}, affines=AFFINES).job("affines")
+    scene, inputs = read_base_scene(job), SimpleNamespace(capture=CaptureReader(job.read("capture")))
+    affine = np.tile(IDENTITY, (scene.n_objects, 1))
+    floor, table = room.names.index("floor"), room.names.index("table")
+    affine[floor, :12] *= 10  # an albedo above 1
+    counts = scene.object_id != table
+    origins, rays = interreflection.camera_rays(job, inputs, SimpleNamespace(affine=affine), scene, counts)
+    geometry = build_geometry(scene.vertices, scene.faces, scene.object_id)
+    shown = np.concatenate([scene.object_id[trace(geometry, o, r[None])[0]] for o, r in zip(origins, rays, strict=True)])
+    assert set(range(scene.n_objects)) - set(shown) == {floor, table}
+    assert len(rays) == min(interreflection.RAYS, len(rays)) > 2000
+    views = np.unique(origins, axis=0, return_counts=True)[1]
+    assert len(views) == len(inputs.capture.used) and views.max() <= -(-interreflection.RAYS // len(views))
 
 
 PLANNED = {

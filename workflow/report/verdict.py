@@ -529,7 +529,7 @@ def _scale(e: Evidence) -> Light:
             ) if not e.raised <= 1 else Finding(GREEN, "No light had to be added to keep albedos below 1"),
             _finding(
                 "light_scale", moved, "The light that was found and the albedo that was predicted disagree by a factor of {}"
-                f" (the light was multiplied by {e.light_scale:.3g})", patch, ".2f",
+                f" (the albedos were divided by {e.light_scale:.3g})", patch, ".2f",
             ) if e.level not in (*FIXED, "mean_albedo") else None,
             _finding(
                 "discrepancy", e.discrepancy,
