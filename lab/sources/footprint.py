@@ -22,7 +22,7 @@ class Seen(NamedTuple):
     Attributes:
         depth: (H, W) z-depth, 0 = nothing.
         face: (H, W) face ids, -1 = nothing.
-        truth: of the points at the centres; none is valid where nothing is seen.
+        truth: of the points at the centres.
     """
 
     depth: Array
@@ -43,14 +43,14 @@ def over_pixels(view: View, look: Callable[[View], Seen], owner: Array) -> Seen:
         owner: (F,) object of each face.
     """
     centre = look(view)
-    own = owner[centre.face]
+    own = np.where(centre.face >= 0, owner[centre.face], -1)
     names = "albedo", "roughness", "metallic"
     total = {name: np.zeros(getattr(centre.truth, name).shape) for name in names}
     count = np.zeros(own.shape, np.int64)
     steps = (np.arange(POINTS) + 0.5) / POINTS - 0.5
     for right, down in np.array(np.meshgrid(steps, steps)).reshape(2, -1).T:
         seen = look(replace(view, cx=view.cx - right, cy=view.cy - down))
-        same = centre.truth.valid & seen.truth.valid & (owner[seen.face] == own)
+        same = centre.truth.valid & seen.truth.valid & (seen.face >= 0) & (owner[seen.face] == own)
         count += same
         for name in names:
             total[name][same] += getattr(seen.truth, name)[same]

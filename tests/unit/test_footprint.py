@@ -76,7 +76,7 @@ def test_points_without_truth_do_not_count_and_pixels_without_keep_the_centre():
     found = over_pixels(VIEW, half, np.zeros(1, int)).truth
     np.testing.assert_array_equal(found.valid, half(VIEW).truth.valid)
     np.testing.assert_allclose(found.roughness[1:], 0.3)
-    beside = look(colour, lambda x, y: (y > 1) & (x % 1 < 0.4))  # the centres have no truth, points beside them have
+    beside = look(lambda x, y: 0.1 * x, lambda x, y: (y > 1) & (x % 1 < 0.4))  # the centres have no truth, points beside them have
     np.testing.assert_array_equal(over_pixels(VIEW, beside, np.zeros(1, int)).truth.roughness, beside(VIEW).truth.roughness)
     nothing = over_pixels(VIEW, look(stripes, known=lambda x, y: np.zeros_like(x, bool)), np.zeros(1, int)).truth
     np.testing.assert_array_equal(nothing.albedo, look(stripes)(VIEW).truth.albedo)
