@@ -45,7 +45,10 @@ def test_texture_finer_than_a_pixel_has_its_mean():
 
 
 def test_all_sixteen_points_count():
-    found = over_pixels(VIEW, look(lambda x, y: ((4 * x).astype(int) % 4 + 1) * ((4 * y).astype(int) % 4 + 2.0)), np.zeros(1, int))
+    def product(x, y):
+        return ((4 * x).astype(int) % 4 + 1) * ((4 * y).astype(int) % 4 + 2.0)
+
+    found = over_pixels(VIEW, look(product), np.zeros(1, int))
     np.testing.assert_allclose(found.truth.roughness, 2.5 * 3.5, rtol=1e-12)  # along a diagonal it would be 10
 
 
@@ -76,7 +79,7 @@ def test_points_without_truth_do_not_count_and_pixels_without_keep_the_centre():
     found = over_pixels(VIEW, half, np.zeros(1, int)).truth
     np.testing.assert_array_equal(found.valid, half(VIEW).truth.valid)
     np.testing.assert_allclose(found.roughness[1:], 0.3)
-    beside = look(lambda x, y: 0.1 * x, lambda x, y: (y > 1) & (x % 1 < 0.4))  # the centres have no truth, points beside them have
+    beside = look(lambda x, y: 0.1 * x, lambda x, y: (y > 1) & (x % 1 < 0.4))  # no centre has a truth
     np.testing.assert_array_equal(over_pixels(VIEW, beside, np.zeros(1, int)).truth.roughness, beside(VIEW).truth.roughness)
     nothing = over_pixels(VIEW, look(stripes, known=lambda x, y: np.zeros_like(x, bool)), np.zeros(1, int)).truth
     np.testing.assert_array_equal(nothing.albedo, look(stripes)(VIEW).truth.albedo)
