@@ -40,6 +40,12 @@ def test_curvature_of_a_power_is_its_closed_form():
     np.testing.assert_allclose(tone.curvature_ratio(y), (1 - exponents.T) / y, rtol=5e-3)
 
 
+def test_dark_pixels_do_not_move_the_knee_of_the_logarithmic_curve():
+    value = np.linspace(0.1, 0.9, 9)[:, None] * np.ones(3)
+    tones = [make_tone(response("identity"), np.concatenate([value, np.zeros((dark, 3))])) for dark in (0, 30)]
+    assert tones[0].knee == tones[1].knee == pytest.approx(0.125) and tones[0].gain == tones[1].gain
+
+
 @pytest.mark.parametrize("objects", [[], [1, 3], [1, 2], [0, 1, 2, 3]])
 def test_chosen_objects_keep_their_pixels_and_clusters(objects):
     problem, _ = problem_of(np.random.default_rng(0), 4, 60)
@@ -214,6 +220,16 @@ def test_metal_is_found_where_it_pays_and_only_there():
     assert fitted[n:, 4].min() > 0.9 and out.model[1].endswith("metal")
     assert fitted[:n, 4].max() < 0.12
     np.testing.assert_allclose(fitted[n:, :3], base[n:, :3], atol=0.05)
+
+
+def test_an_object_of_metal_and_paint_keeps_the_metallic_that_was_predicted():
+    rng = np.random.default_rng(9)
+    n = 600
+    base = np.c_[rng.uniform(0.4, 0.6, (3 * n, 3)), np.full(3 * n, 0.35), np.full(3 * n, 0.05)]
+    base[:n, 4] = np.where(np.arange(n) % 2, 0.95, 0.05)
+    problem, _ = problem_of(rng, 3, n, truth=np.tile(IDENTITY, (3, 1)), base=base)
+    out = fit_affines(problem, response("identity"), FitOptions())
+    np.testing.assert_array_equal(out.affine[:, 14:], [[1, 0], [0, 0], [0, 0]])
 
 
 def _lambertian(rng, n, albedo, dim=1.0):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from iif_core.light.emission import emitters, photographs
+from iif_core.light.emission import response as light_response
 from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.emitters import METAL
 from iif_core.light.emission.find import find_light, look_around
@@ -223,6 +224,17 @@ def test_linear_photographs_have_no_response(closed):
     found, camera = calibrated(photos, ("identity",), None, given=True)
     assert camera.response.params.size == 0 and found.gains is photos.gains
     assert any(line.startswith("camera response") for line in said)
+
+
+def test_patches_that_views_share_have_the_size_of_the_pixels_that_are_looked_at(closed, monkeypatch):
+    photos, asked = closed[0], []
+    monkeypatch.setattr(light_response, "patch_edge", lambda footprint, extent: asked.append(footprint) or 0.2)
+    for share in (1.0, 0.25):
+        kept = type(photos.records)(photos.records)
+        kept.share = share
+        light_response._shared_surface(replace(photos, records=kept))
+    sizes = [photos.records[view].median_depth / view.fx for view in photos.views]
+    np.testing.assert_allclose(asked, [np.median(sizes), 2 * np.median(sizes)])
 
 
 def test_a_measured_response_is_taken_as_it_is(closed):

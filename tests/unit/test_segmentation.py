@@ -1,5 +1,7 @@
 """Stage segmentation: objects from given ids or from shape, and the tables and maps derived from them."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -8,6 +10,7 @@ from tests.errors import refused
 from tests.unit import own_scene as own
 from workflow.artifacts import StageReader
 from workflow.artifacts.store import ids_from_disk
+from workflow.segmentations.geometry import mean_face_colour
 
 
 def tables(root):
@@ -107,3 +110,23 @@ def test_given_without_ids_says_what_to_do(tmp_path):
     own.photographed(path, 2, depth=False)
     with refused("segmentation: {kind: given}", "segmentation: {kind: geometry}"):
         own.run(tmp_path, "capture", "segmentation")
+
+
+@pytest.mark.parametrize(
+    ("is_hdr", "scale", "expected"), [(True, 10.0, [0.4, 2 / 3]), (False, 1.0, [0.2 / 2**0.45, 0.6 / 2**0.45])]
+)
+def test_colour_of_a_face_is_alike_in_dark_and_bright_photographs(is_hdr, scale, expected):
+    """Radiance is relative to the mean of its photograph, sensor values are relative to the exposure."""
+    every = np.ones(4, bool)
+    value = scale * np.array([0.2, 0.2, 0.2, 0.6])[:, None] * np.ones(3)
+    maps = SimpleNamespace(valid=every, hit=every, value=value, face=np.array([0, 0, 0, 1]))
+    surface = SimpleNamespace(
+        prior=None,
+        faces=np.zeros((3, 3)),
+        capture=SimpleNamespace(is_hdr=is_hdr),
+        views=lambda fold: [SimpleNamespace(exposure=2.0)],
+        decoded=SimpleNamespace(maps=lambda view: maps),
+    )
+    colour, pixels = mean_face_colour(surface)
+    np.testing.assert_allclose(colour, np.array([*expected, 0.0])[:, None] * np.ones(3), rtol=1e-12)
+    assert pixels.tolist() == [3, 1, 0]
