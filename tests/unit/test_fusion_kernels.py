@@ -1,16 +1,21 @@
 """The compiled loops against plain float64 NumPy, in single and half precision."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iif_core.fusion import kernels
+from iif_core.fusion.blocks import Block
+from iif_core.fusion.options import FusionOptions
 from iif_core.fusion.problem import LOWEST
 from iif_core.fusion.sums import SegmentSums
 from iif_core.reflectance.material import IDENTITY
 from lab.published.fusion.divergence import reference_scale
 from lab.published.fusion.sgd.pool import as_floats
+from tests.errors import refused
 
 NONE = np.zeros((0, 0), bool)
 
@@ -105,6 +110,21 @@ def test_network_sorts_every_zero_one_sequence_it_is_shown(n):
     for low, high in network:
         planes[low], planes[high] = np.minimum(planes[low], planes[high]), np.maximum(planes[low], planes[high])
     np.testing.assert_array_equal(planes, expected)
+
+
+def test_network_has_as_few_comparators_as_batchers():
+    assert [len(kernels.sorting_network(n)) for n in (1, 2, 4, 8, 16, 32)] == [0, 1, 5, 19, 63, 191]
+
+
+@pytest.mark.parametrize("again", [0, 1])
+def test_a_segment_of_two_views_is_refused_by_its_number(again):
+    words, _, weight, start, _ = pixels(counts=(9, 9))
+    sums = SegmentSums(8, 3, np.ones(1))
+    first = Block(words, np.zeros(18, np.int32), weight, np.array([2, 5], np.int32), start, np.ones(3, bool), NONE, NONE)
+    sums.add(first, FusionOptions())
+    segments = np.array([[5, 7], [4, 5]][again], np.int32)
+    with refused("segment 5 "):
+        sums.add(replace(first, segments=segments), FusionOptions())
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 8, 16, 17])

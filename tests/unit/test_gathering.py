@@ -64,6 +64,17 @@ def test_furnace():
     np.testing.assert_allclose(np.exp(albedo), 1.0, atol=0.1)
 
 
+def test_cells_that_see_nothing_are_nearly_dark():
+    points, normals, wall = cube()
+    cells = cells_of(points, normals, wall, np.full((len(points), 3), 0.5), np.zeros(len(points), bool))
+    found = gather(cells, trace_cube)
+    dark = np.arange(len(cells)) % 3 == 0
+    found.known[dark], found.share[dark] = 0.0, 0.0
+    light, albedo = fit_light(cells, found, 0.4)
+    assert np.isfinite(light).all() and np.isfinite(albedo).all()
+    assert light[dark].max() < light[~dark].min()
+
+
 def test_lamp_of_unknown_radiance_is_found():
     """A clipped lamp on the ceiling of a room with coloured walls: the albedos come out, and no light is left inside walls."""
     points, normals, wall = cube()
