@@ -111,6 +111,18 @@ def test_smooth_errors_are_told_from_noise():
     np.testing.assert_allclose(slow, 0.2, rtol=0.05)
 
 
+def test_smooth_error_of_the_room_is_that_of_its_large_objects():
+    """An object of one patch has the error of the room, in which objects count by their pixels."""
+    owner = np.r_[np.repeat([0, 1], 60), 2]
+    wave = np.sin(np.arange(60) / 60 * 2 * np.pi) * np.sqrt(2)
+    step = np.r_[0.3 * wave, 0.1 * wave, 0.0]
+    found = [
+        object_levels._smooth_error_of_light(step, np.ones(121), owner, np.array(pixels))[2]
+        for pixels in ([1000.0, 1.0, 50.0], [1.0, 1000.0, 50.0])
+    ]
+    np.testing.assert_allclose(found, [0.3, 0.1], rtol=0.05)
+
+
 def test_scatter_of_predictions_is_that_of_their_gains():
     """Predictions that are off by known factors; objects that nothing shows have the scatter of the room."""
     rng = np.random.default_rng(1)

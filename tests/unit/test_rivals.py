@@ -9,6 +9,7 @@ from iif_core.camera.interpolation import Shown, by_others
 from iif_core.camera.view import View
 from iif_core.surface.triangles import face_geometry, towards_viewer
 from tests.unit import own_scene as own
+from workflow.artifacts.store import ids_to_disk
 from workflow.scoring import rivals
 
 COLOUR = np.array([[0.3, 0.5, 0.2], [0.7, 0.4, 0.6]])  # of the room and of the block in it
@@ -124,3 +125,20 @@ def test_the_rivals_are_seen_from_the_eye_of_the_held_out_view(seen, monkeypatch
     assert known.sum() > 1400
     for name, expected in (("photo_mean", mean), ("photo_nearest", blend)):
         np.testing.assert_allclose(found[name].reshape(-1, 3)[at[known]], expected[known], rtol=1e-5)
+
+
+def test_mean_photographs_as_albedo_have_the_level_of_the_base(monkeypatch):
+    """Cells of radiance 1, 2 and 40 in their views; the base has their geometric mean level, and no albedo is above 1."""
+    cell, shown = np.array([[0, 0, 1], [1, 2, -1]]), np.array([[0.5, 1.5, 2.0], [2.0, 40.0, 9.0]])
+    level = np.array([0.4, 0.2, 0.1])
+    table = {**{f"albedo_{c}": 0.1 * level[i] * np.array([1, 2, 40.0, 7.0]) for i, c in enumerate("rgb")}}
+    base = SimpleNamespace(
+        table=lambda name: table, has=lambda name: "b" not in name, exr=lambda name: {"cell.id": ids_to_disk(cell)}
+    )
+    monkeypatch.setattr(rivals, "read_base", lambda job: base)
+    rival, view = object.__new__(rivals.OtherPhotographs), SimpleNamespace(name="a")
+    rival._job, rival._capture = None, SimpleNamespace(used=[view, SimpleNamespace(name="b")])
+    rival.shown = lambda view: SimpleNamespace(usable=np.ones(cell.shape, bool), radiance=shown[..., None] * np.ones(3))
+    expected = np.minimum(0.1 * level * np.array([1, 2, 40.0])[:, None], 1.0)
+    np.testing.assert_allclose(rival._as_albedo(), [*expected, [0, 0, 0], [0, 0, 0]], rtol=1e-5)
+    assert (expected == 1.0).sum() == 1
