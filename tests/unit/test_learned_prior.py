@@ -439,3 +439,17 @@ def test_roughness_does_not_cross_borders_of_objects(room):
     maps = np.concatenate([maps, np.zeros((*small.depth.shape, 1))], -1)[None]
     out, _ = enlarged(maps, np.zeros((*small.depth.shape, 3)), small, view, 4)
     assert np.abs(out[0, ..., 3] - np.where(view.object_id == 1, 0.9, 0.1)).max() < 0.01
+
+
+def test_medians_of_objects_are_those_of_all_their_pixels():
+    """Whatever views bring them, and without the pixels that do not count; to a bin."""
+    rng = np.random.default_rng(0)
+    group = np.r_[np.full(40, 5), rng.choice([2, 5, 9], 3000)]  # the first view shows one object alone
+    values, clear = rng.normal(0, 1, (3040, 3)), rng.random(3040) < 0.7
+    clear[group == 9] = False
+    medians = inputs._Medians()
+    for part in (slice(0, 40), slice(40, 1700), slice(1700, 3040)):
+        medians.add(group[part], values[part], clear[part])
+    expected = [np.median(values[clear & (group == g)], 0) for g in (2, 5)]
+    assert medians.group.tolist() == [2, 5, 9]
+    np.testing.assert_allclose(medians.values(), [*expected, [0, 0, 0]], atol=1 / 64)
