@@ -50,9 +50,8 @@ def test_dark_pixels_do_not_move_the_knee_of_the_logarithmic_curve():
 def test_pixels_without_light_are_left_out_at_any_level_of_the_light(level):
     problem, _ = problem_of(np.random.default_rng(0), 1, 200)
     share = np.r_[4e-4, 3e-3, np.ones(198)]
-    lit = {name: tuple(level * x * share.reshape(-1, *[1] * (x.ndim - 1)) for x in getattr(problem, name)) for name in ("s0", "s1")}
     light = np.full((200, 3), level) * share[:, None]
-    px, _ = prepare_pixels(replace(problem, diffuse=(light,), **lit), response("identity"))
+    px, _ = prepare_pixels(replace(problem, diffuse=(light,)), response("identity"))
     assert sorted(px.index) == [*range(1, 200)]
 
 
