@@ -5,6 +5,7 @@ from dataclasses import fields
 import pytest
 from pydantic import ValidationError
 
+from lab import methods
 from lab.published.fitting.sgd import SgdOptions
 from lab.published.fusion.direct import POLISH
 from tests.errors import refused
@@ -123,3 +124,11 @@ def test_a_preset_lies_between_the_scene_and_the_variant(study):
 def test_a_preset_that_is_not_there_is_refused_with_those_that_are(study):
     with refused("lab/config/studies/presets/publshed.yaml", "published", "published_repaired"):
         settings.load("t--a-theirs-s0", "draft", study("{preset: publshed}"))
+
+
+def test_settings_without_the_laboratory_s_mean_the_product():
+    """Manifests of stages that the product ran have none of them, and costs are gathered from manifests."""
+    settings = {stage: {} for stage in ("base", "emission", "shading", "affines")}
+    stages = methods.base, methods.emission, methods.shading, methods.second_look, methods.affines
+    assert [stage(settings) for stage in stages] == [None] * 5
+    assert methods.affines({**settings, "affines": {"solver": "adam"}}) and methods.base({**settings, "base": {"judge": True}})
