@@ -58,4 +58,4 @@ def scale(kind: str, factor: float, relative_error: float) -> Decision:
         "lamp": "the given radiance of a lamp",
     }
     reason = f"{reasons[kind]}; the albedos were divided by {factor:.4g} (standard error {100 * relative_error:.2g} %)"
-    return decision("scale", abs(factor - 1.0) > 1e-3, "factor on the light that the fit was given", factor, 1.0, reason)
+    return decision("scale", abs(factor - 1.0) > 1e-3, "factor by which the albedos were divided", factor, 1.0, reason)
