@@ -36,10 +36,10 @@ def sandwich_covariance(
     Returns:
         Both float64; 0 for numbers that were not free.
     """
-    free, by_response, schur = state.free, system.by_response, system.schur
-    # T_o of Eq. M.40: an object follows the response also through the centre of its prior.
-    if prior.drift is not None:
-        by_response = by_response - system.inverse @ prior.drift
+    free, own_share, schur = state.free, system.by_response, system.schur
+    # T_o of Eq. M.40: an object follows the response also through the centre of its prior. What the error of that centre does to
+    # the response goes through B C alone: the response was fitted with the centre held.
+    by_response = own_share if prior.drift is None else own_share - system.inverse @ prior.drift
 
     # -------- what each cluster k moves: B v_k, and the response by d_k --------
     # Errors of different clusters are taken as independent, so their products add up.
@@ -56,7 +56,7 @@ def sandwich_covariance(
     if prior.scatter is not None:
         prior_scatter = np.where(free[:, :, None] & free[:, None, :], prior.scatter, 0.0)
     # Covariance that the prior of each object causes in the response.
-    of_priors = schur @ by_response.transpose(0, 2, 1) @ prior_scatter @ by_response @ schur
+    of_priors = schur @ own_share.transpose(0, 2, 1) @ prior_scatter @ own_share @ schur
     total = moved.T @ moved + of_priors.sum(0) + schur @ curve_prior.scatter @ schur
 
     # -------- covariance of each object: its clusters, its prior, and the response as everything else moves it --------
@@ -67,11 +67,11 @@ def sandwich_covariance(
         # The object's clusters move it directly and through the response. Both movements are added before they are multiplied,
         # and `others` leaves out what the same clusters and the object's prior do to the response.
         p = alone[part] - d @ by_response[o].T
-        both = system.inverse[o] + by_response[o] @ schur @ by_response[o].T
+        both = system.inverse[o] + by_response[o] @ schur @ own_share[o].T
         others = total - d.T @ d - of_priors[o]
         # Eq. M.39: few clusters say little about their own scatter, so the covariance is enlarged.
         few = (leverage[part] ** 2).sum() / max(leverage[part].sum() ** 2, 1e-100)  # 1 / nu
-        out[o] = (1.0 + 0.5 * few) ** 2 * p.T @ p + both @ prior_scatter[o] @ both + by_response[o] @ others @ by_response[o].T
+        out[o] = (1.0 + 0.5 * few) ** 2 * p.T @ p + both @ prior_scatter[o] @ both.T + by_response[o] @ others @ by_response[o].T
     i = np.arange(NUMBERS)
     out[:, i, i] = np.maximum(out[:, i, i], 0.0)  # products of matrices round variances of nothing below 0
     return out, total

@@ -89,6 +89,28 @@ def test_few_clusters_enlarge_the_covariance(monkeypatch):
         np.testing.assert_allclose(found[0], expected, rtol=1e-6)
 
 
+@pytest.mark.parametrize("drift", [0.0, 30.0])
+def test_the_error_of_a_prior_reaches_the_response_as_its_centre_was_held(monkeypatch, drift):
+    """One number, curvature h, coupling c, prior weight w: the response moves by -S c w / (h + w) times the error of the centre,
+    however strongly the centre follows the response, and the number by w / (h + w) and by the response."""
+    h, c, w, spread, schur = 3.0, 2.0, 5.0, 0.1, np.array([[0.25]])
+    inverse, coupling = np.eye(16)[None] / (h + w), np.zeros((1, 16, 1))
+    coupling[0, 0] = c
+    scatter, follows = np.zeros((1, 16, 16)), np.zeros((1, 16, 1))
+    scatter[0, 0, 0], follows[0, 0] = (w * spread) ** 2, w * drift
+    nothing = slice(0, 1), np.zeros((1, 17)), np.zeros((1, 17, 17))
+    monkeypatch.setattr(covariance, "evaluate_clusters", lambda *_: [nothing])
+    system = Arrowhead(inverse, coupling, schur, np.zeros((1, 16)), np.zeros(1), inverse @ coupling)
+    state = DescentState(np.zeros((1, 16)), np.ones((1, 16), bool), np.zeros(1), np.zeros(1))
+    prior = GaussianPrior(np.zeros((1, 16)), np.zeros((1, 16, 16)), scatter, follows)
+    px, curve_prior = SimpleNamespace(n_objects=1, first=np.array([0, 1])), SimpleNamespace(scatter=np.zeros((1, 1)))
+    of_object, of_response = covariance.sandwich_covariance(px, state, system, prior, curve_prior, None, FitOptions())
+    response = -schur[0, 0] * c * w / (h + w) * spread
+    number = w / (h + w) * spread - (c - w * drift) / (h + w) * response
+    np.testing.assert_allclose(of_response, response**2, rtol=1e-9)
+    np.testing.assert_allclose(of_object[0, 0, 0], number**2, rtol=1e-9)
+
+
 @pytest.mark.long
 def test_a_prior_that_decides_the_response_gives_it_its_error():
     problem, _ = planted(0, 3)
