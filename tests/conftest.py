@@ -44,9 +44,10 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
         return (yield)
 
     def end() -> None:
-        item.add_report_section(
-            "call", "hanging", f"after {hanging.LIMIT:.0f} s these were killed:\n{hanging.end_all(os.getpid())}"
-        )
+        def tell(processes: str) -> None:
+            item.add_report_section("call", "hanging", f"after {hanging.LIMIT:.0f} s these are killed:\n{processes}")
+
+        hanging.end_all(os.getpid(), tell)
 
     timer = threading.Timer(hanging.LIMIT, end)
     timer.daemon = True

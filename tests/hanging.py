@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -25,16 +26,16 @@ def descendants(pid: int) -> list[int]:
     return children + [one for child in children for one in descendants(child)]
 
 
-def end_all(pid: int, patience: float = 5.0) -> str:
-    """Kill all that a process started, and return a table of it. With SIGABRT at first, by which Python tells where it was if the
-    variable PYTHONFAULTHANDLER is set."""
+def end_all(pid: int, tell: Callable[[str], object], patience: float = 5.0) -> None:
+    """Kill all that a process started, and `tell` a table of it beforehand: the test that waits for it fails at once. With SIGABRT
+    at first, by which Python tells where it was if the variable PYTHONFAULTHANDLER is set."""
     found = descendants(pid)
     if not found:
-        return "it has started no process"
-    table = subprocess.run(["ps", "-ww", "-o", COLUMNS, "-p", ",".join(map(str, found))], capture_output=True, text=True).stdout
+        tell("it has started no process")
+        return
+    tell(subprocess.run(["ps", "-ww", "-o", COLUMNS, "-p", ",".join(map(str, found))], capture_output=True, text=True).stdout)
     for number, wait in ((signal.SIGABRT, patience), (signal.SIGKILL, 0.0)):
         for one in found:
             with suppress(ProcessLookupError):
                 os.kill(one, number)
         time.sleep(wait)
-    return table

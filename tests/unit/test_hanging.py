@@ -16,9 +16,12 @@ from tests import hanging
 process = subprocess.Popen([sys.executable, "-c", {IN_VAIN!r}], stdout=subprocess.PIPE)
 assert process.stdout.readline() == b"ready\\n"
 assert process.pid in hanging.descendants(os.getpid()) and len(hanging.descendants(os.getpid())) == 2
-print(hanging.end_all(os.getpid(), patience=0.2))
+def tell(processes):
+    assert process.poll() is None  # the test that waits for it has not failed yet
+    print(processes)
+hanging.end_all(os.getpid(), tell, patience=0.2)
 assert process.wait(30) < 0 and process.stdout.read() == b""  # which ends when its child has ended, too
-print(hanging.end_all(os.getpid()))
+hanging.end_all(os.getpid(), print)
 """
 
 
