@@ -27,8 +27,8 @@ def descendants(pid: int) -> list[int]:
 
 
 def end_all(pid: int, tell: Callable[[str], object], patience: float = 5.0) -> None:
-    """Kill all that a process started, and `tell` a table of it beforehand: the test that waits for it fails at once. With SIGABRT
-    at first, by which Python tells where it was if the variable PYTHONFAULTHANDLER is set."""
+    """Kill all that a process started, and `tell` a table of it beforehand, because the test that waits for it fails at once.
+    With SIGABRT at first, by which Python tells where it was if the variable PYTHONFAULTHANDLER is set."""
     found = descendants(pid)
     if not found:
         tell("it has started no process")

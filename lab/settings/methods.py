@@ -122,6 +122,8 @@ class Affines(affines.Affines):
     exact for every cell; `adam`: gradient descent on the same loss."""
     epochs: int = Field(3, ge=1)
     """`sgd`, `adam`, `published`: passes over the pixels; the step size falls to a fifth after each."""
+    steps: int | None = Field(None, ge=1)
+    """`sgd`, `adam`, `published`: steps over all epochs, with as many passes as they need; default: one pass an epoch."""
     batch: int = Field(32768, ge=1)
     """`sgd`, `adam`, `published`: pixels in one step."""
     rate: float | None = Field(None, gt=0)

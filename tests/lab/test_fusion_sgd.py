@@ -229,8 +229,10 @@ def test_published_schedules():
     temperature = [sgd_pool.temperature_at(paper, step, 8080) for step in (0, 1, 100, 101, 8079)]
     np.testing.assert_allclose(temperature, 0.85 ** np.array([0, 1, 1, 2, 81]))
     assert temperature[-1] == pytest.approx(1.9e-6, rel=0.02)
-    rate = [sgd_pool.learning_rate_at(paper, step, 8080, 808) for step in (0, 1615, 1616, 8079)]
+    rate = [sgd_pool.learning_rate_at(paper, step, 8080) for step in (0, 1615, 1616, 8079)]
     np.testing.assert_allclose(rate, 0.01 * 0.5 ** np.array([0, 0, 1, 4]))
+    few = [sgd_pool.learning_rate_at(paper, step, 240) for step in (0, 47, 48, 96, 144, 192, 239)]  # ten epochs of 24 steps
+    np.testing.assert_allclose(few, 0.01 * 0.5 ** np.array([0, 0, 1, 2, 3, 4, 4]))
 
 
 @pytest.mark.parametrize("steps", [10, 81, 1000])
@@ -239,7 +241,7 @@ def test_safe_schedules_do_not_depend_on_the_number_of_steps(steps):
     temperature = [sgd_pool.temperature_at(options, step, steps) for step in range(steps)]
     assert temperature[0] == 1 and temperature[-1] == pytest.approx(0.85 ** (81 - 81 / steps), rel=0.2)
     assert min(sgd_pool.temperature_at(SgdOptions(), step, steps) for step in range(steps)) == 1e-3
-    rate = [sgd_pool.learning_rate_at(options, step, steps, 1) for step in range(steps)]
+    rate = [sgd_pool.learning_rate_at(options, step, steps) for step in range(steps)]
     np.testing.assert_allclose(np.unique(rate), 0.01 / 2.0 ** np.arange(5)[::-1])
 
 

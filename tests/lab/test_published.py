@@ -252,6 +252,21 @@ def test_descent_lowers_the_loss_and_goes_on_after_a_kill():
     assert resumed.history == fit.history and [state.step for state in seen] == [114]
 
 
+@pytest.mark.parametrize(("steps", "per_epoch"), [(3, 1), (114, 38), (200, 67)])
+def test_a_descent_of_so_many_steps(steps, per_epoch):
+    """An epoch takes its share of the steps, however often it passes over the pixels."""
+    problem, curve = fit_problem(np.random.default_rng(6)), response("ggcm")
+    options = fitting.PublishedOptions(rate=2.0, batch=64, steps=steps)
+    states = list(fitting.descend(problem, curve, fitting.PublishedState.start(6, curve), options))
+    assert [state.step for state in states] == [per_epoch, 2 * per_epoch, 3 * per_epoch]
+    again = list(fitting.descend(problem, curve, states[0], options))
+    np.testing.assert_array_equal(again[-1].affine, states[-1].affine)
+    fit = fitting.fit_published(problem, curve, options)
+    assert fit.converged and fit.iterations == 3 * per_epoch and len(fit.history) == 3
+    passes = fitting.fit_published(problem, curve, fitting.PublishedOptions(rate=2.0, batch=64))
+    assert np.array_equal(passes.affine, fit.affine) == (steps == 114)  # one pass an epoch
+
+
 def test_a_descent_that_leaves_the_finite_numbers_says_so():
     problem, curve = fit_problem(np.random.default_rng(7)), response("ggcm")
     fit = fitting.fit_published(problem, curve, fitting.PublishedOptions(rate=1e9, batch=64))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
@@ -30,6 +31,7 @@ class PublishedOptions:
         rate: size of a step; decay: factor on it after each epoch.
         epochs: passes over the pixels; batch: pixels of a step; seed: of their order.
         free_response: fit the parameters of the response, too.
+        steps: steps over all epochs, with as many passes over the pixels as they need; None: one pass an epoch.
     """
 
     rate: float = 10.0
@@ -38,6 +40,11 @@ class PublishedOptions:
     batch: int = 32768
     seed: int = 0
     free_response: bool = True
+    steps: int | None = None
+
+    def per_epoch(self, pixels: int) -> int:
+        """Return the number of steps of an epoch for so many pixels."""
+        return -(-(self.steps or 0) // self.epochs) or -(-pixels // self.batch)
 
 
 @dataclass(frozen=True)
@@ -147,13 +154,11 @@ def descend(
     because the clamps have no gradient. They end the descent, and the last yielded state is the one before.
     """
     n = len(problem.object_id)
-    per_epoch = -(-n // options.batch)
+    per_epoch = options.per_epoch(n)
     for epoch in range(state.step // max(per_epoch, 1), options.epochs if n else 0):
-        order = np.random.default_rng([0x616666, options.seed, epoch]).permutation(n)
         affine, params, losses = state.affine, state.params, []
         rate = options.rate * options.decay**epoch
-        for first in range(0, n, options.batch):
-            rows = np.sort(order[first : first + options.batch])
+        for rows in islice(_batches(np.random.default_rng([0x616666, options.seed, epoch]), n, options.batch), per_epoch):
             value, by_affine, by_params = loss_and_gradient(problem, rows, affine, replace(response, params=params))
             affine = affine - rate * by_affine
             if options.free_response and params.size:
@@ -163,6 +168,14 @@ def descend(
             return
         state = PublishedState(affine, params, state.step + per_epoch, (*state.loss, *losses))
         yield state
+
+
+def _batches(rng: np.random.Generator, n: int, size: int) -> Iterator[np.ndarray]:
+    """Yield the sorted pixels of step after step, without end; each pass over the pixels has another order."""
+    while True:
+        order = rng.permutation(n)
+        for first in range(0, n, size):
+            yield np.sort(order[first : first + size])
 
 
 def fit_published(
@@ -179,7 +192,7 @@ def fit_published(
     opt, mean = options or PublishedOptions(), merged(problem)
     seen = mean.object_id >= 0
     used = mean if seen.all() else mean.take(np.flatnonzero(seen))  # a copy may not fit into memory
-    n, per_epoch = len(used.object_id), -(-len(used.object_id) // opt.batch)
+    n, per_epoch = len(used.object_id), opt.per_epoch(len(used.object_id))
     state = PublishedState.start(problem.n_objects, response) if state is None else state
     for after in descend(used, response, state, opt):
         state = after
@@ -202,7 +215,7 @@ def fit_published(
         converged=done == whole,
         response_covariance=np.zeros((size, size)),
         iterations=done,
-        reason=f"{opt.epochs} epochs of {n} pixels" if done == whole else f"diverged after {done} of {whole} steps",
+        reason=f"{whole} steps, {n} pixels" if done == whole else f"diverged after {done} of {whole} steps",
     )
 
 

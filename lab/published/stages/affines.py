@@ -25,7 +25,7 @@ def run(job: Job) -> None:
         draw = _every if settings.pixels == "all" else None
         affines.fit(job, lambda job, prior: partial(_published, job), "published", draw, merged=True)
     else:
-        own = SgdOptions(settings.solver, settings.rate, settings.epochs, settings.batch, seed=job.seed)
+        own = SgdOptions(settings.solver, settings.rate, settings.epochs, settings.batch, seed=job.seed, steps=settings.steps)
         affines.fit(job, lambda job, prior: partial(fit_affines_sgd, options=own), settings.solver)
 
 
@@ -43,7 +43,7 @@ def _published(job: Job, problem: FitProblem, start: Response) -> FitResult:
     """Run the published descent, from where an earlier run of the same job was killed."""
     settings = job.settings.affines
     rate = PublishedOptions.rate if settings.rate is None else settings.rate
-    options = PublishedOptions(rate, epochs=settings.epochs, batch=settings.batch, seed=job.seed)
+    options = PublishedOptions(rate, epochs=settings.epochs, batch=settings.batch, seed=job.seed, steps=settings.steps)
     kept = kept_state(job.writer, "descent")
     at = kept and PublishedState(**kept[0], step=kept[1]["step"], loss=tuple(kept[1]["loss"]))
 

@@ -21,7 +21,7 @@ class SgdOptions:
         epochs: passes over the pixels if `iterations` is None.
         iterations: steps; None = as many as whole batches fit into `epochs` passes [None].
         learning_rate: of texture, affine maps and logits. lr_schedule: halved at 20, 40, 60, 80 % of the steps
-            (`fraction`) or after 2, 4, 6, 8 epochs (`epochs`) [epochs].
+            (`fraction`) or after 2, 4, 6, 8 of `epochs` equal parts of the steps (`epochs`) [epochs].
         temperature: of logits and errors at the start. anneal: factor on it, applied 81 times evenly over the steps
             (`fraction`, Eq. F.61) or every 100 steps (`steps`, Eq. F.17, whose last temperature depends on the size of the
             scene) [steps].

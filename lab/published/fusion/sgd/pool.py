@@ -163,17 +163,17 @@ def temperature_at(options: SgdOptions, step: int, steps: int) -> float:
     return max(options.temperature * options.anneal**times, options.temperature_floor, _MIN_TEMPERATURE)
 
 
-def learning_rate_at(options: SgdOptions, step: int, steps: int, steps_per_epoch: int) -> float:
+def learning_rate_at(options: SgdOptions, step: int, steps: int) -> float:
     """Return the learning rate of a step.
 
     Args:
-        options: schedule; step: number of the step, from 0; steps: their number; steps_per_epoch: for schedule `epochs`.
+        options: schedule; step: number of the step, from 0; steps: their number, which `epochs` divides into equal epochs.
 
     Returns:
         Rate, halved up to four times.
     """
     if options.lr_schedule == "epochs":
-        times = step // (2 * steps_per_epoch)
+        times = step * options.epochs // (2 * steps)
     else:
         times = step * (_HALVINGS + 1) // steps
     return options.learning_rate * 0.5 ** min(times, _HALVINGS)

@@ -175,7 +175,7 @@ def _solve(
         temperature = temperature_at(options, step, steps)
         if choose and step == choose_at:
             engine.fix(_chosen(engine.errors(temperature), pool))
-        lr = learning_rate_at(options, step, steps, per_epoch)
+        lr = learning_rate_at(options, step, steps)
         pixels = next(stream)
         coordinates = None
         if pool.coordinates is not None:
