@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.errors import refused
-from tests.unit.transport_rooms import box, lambertian, quad
+from tests.unit.transport_rooms import box, constant_cache, lambertian, quad
 
 
 def test_extremes_are_finite(T, room):
@@ -36,6 +36,36 @@ def test_extremes_are_finite(T, room):
         ).all()
     dark = T.Emitters(room.geometry, np.zeros((len(room.faces), 3)))
     assert not T.render(T.Scene(room.geometry, room.material, dark), room.origin, room.directions, T.PathOptions(2, 4, 0)).any()
+
+
+def test_light_beyond_float32_is_named_and_does_not_travel(T, room):
+    """A few paths to surface of 3e38 add up to infinity."""
+    scene = T.Scene(room.geometry, room.material, T.Emitters(room.geometry, np.full((len(room.faces), 3), 3e38)))
+    at, paths = (room.points[:50], room.normals[:50], room.wo[:50]), T.PathOptions(8, 2, 0)
+    with pytest.raises(ArithmeticError, match="of 150 "):
+        T.render(scene, room.origin, room.directions[:50], paths)
+    with pytest.raises(ArithmeticError):
+        T.shading_caches(scene, *at, [0.02, 1], paths)
+    shaded = T.ShadingPoints(*at, np.ones((50, 3)), np.ones(50), np.zeros(50))
+    cached = T.Scene(room.geometry, room.material, None, constant_cache(T, [[3e38] * 3]))
+    with pytest.raises(ArithmeticError):
+        T.transport_matrix(cached, shaded, T.EmitterColumns(room.group, 2, room.side), paths)
+
+
+def test_sums_over_the_lanes_of_a_point(llvm):
+    """Two points of three lanes, with two rows of two numbers a lane; one number that is not finite is named."""
+    from iif_core.light.transport.arrays import Batch
+
+    values = np.arange(24, dtype=np.float32).reshape(2, 3, 2, 2)
+    batch = Batch(slice(5, 7), 3, 15)
+    np.testing.assert_array_equal(batch.collect_rows(llvm.Float(values.ravel()), 2, 2), values.sum(1))
+    np.testing.assert_array_equal(batch.collect(llvm.Float(values[:, :, 0, 0].ravel())), values[:, :, 0, 0].sum(1))
+    for wrong in (np.nan, np.inf):
+        values[1, 2, 0, 0] = wrong
+        with pytest.raises(ArithmeticError, match="1 of 8 "):
+            batch.collect_rows(llvm.Float(values.ravel()), 2, 2)
+        with pytest.raises(ArithmeticError, match="1 of 2 "):
+            batch.collect(llvm.Float(values[:, :, 0, 0].ravel()))
 
 
 def test_far_from_the_origin_nothing_shadows_itself(T):

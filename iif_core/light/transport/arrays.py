@@ -100,6 +100,19 @@ def checked_points(points: ArrayLike, normals: ArrayLike, wo: ArrayLike) -> tupl
     return points, np.where(away[:, None], -normals, normals), wo
 
 
+class TransportError(ArithmeticError):
+    """Traced light is NaN or infinite. The input was checked before, so the fault is ours, a library's or the machine's."""
+
+
+def _finite(light: Array) -> Array:
+    wrong = np.count_nonzero(~np.isfinite(light))
+    if wrong:
+        raise TransportError(
+            f"{wrong} of {light.size} traced numbers are not finite; the same command tells whether they are so again"
+        )
+    return light
+
+
 SAMPLES_PER_LANE = 8
 """Few enough that one view fills many cores (Dr.Jit gives a thread 16384 lanes), enough to outweigh the start of a lane."""
 
@@ -136,8 +149,13 @@ class Batch:
         return first, first + each + dr.select(lane < left, mi.UInt32(1), 0)
 
     def collect(self, lane_sums: Any) -> Array:
-        """Sum over the lanes of every point, (points,) or (points, width)."""
-        return to_numpy(dr.block_sum(lane_sums, self.split) if self.split > 1 else lane_sums)
+        """Sum over the lanes of every point, (points,) or (points, width); raises TransportError."""
+        return _finite(to_numpy(dr.block_sum(lane_sums, self.split) if self.split > 1 else lane_sums))
+
+    def collect_rows(self, rows: Any, *shape: int) -> Array:
+        """Sum over the lanes of every point, (points, *shape), of `rows` that hold so many numbers for each lane; the lanes are
+        added in a fixed order. Raises TransportError."""
+        return _finite(to_numpy(rows).reshape(-1, self.split, *shape).sum(axis=1))
 
     def streams(self, seed: int, number: Array | None = None) -> Any:
         """One PCG32 stream per lane, hashed from seed (any integer >= 0) and lane number

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
-from iif_core.light.transport.arrays import batches, on_device, rows_of, to_numpy
+from iif_core.light.transport.arrays import batches, on_device, rows_of
 from iif_core.light.transport.kernels import World
 from iif_core.light.transport.render import radiance_sum
 from iif_core.light.transport.scene import PathOptions, Scene
@@ -116,6 +116,5 @@ def render_lamps(
             dr.opaque(mi.UInt32, paths.max_bounces),
         )
         dr.eval(gain, sums)
-        # (points, lanes of a point, lamp, channel).
-        result[batch.part] = to_numpy(sums).reshape(-1, batch.split, lamps, 3).sum(axis=1)
+        result[batch.part] = batch.collect_rows(sums, lamps, 3)
     return result / np.float32(paths.samples)

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from iif_core.light.transport.arrays import batches, checked_points, on_device, to_numpy
+from iif_core.light.transport.arrays import batches, checked_points, on_device
 from iif_core.light.transport.geometry import cosine_directions, nearest_hit, offset_from, trace
 from iif_core.light.transport.kernels import (
     Vertex,
@@ -203,7 +203,7 @@ def light_maps(
             dr.opaque(mi.UInt32, paths.max_bounces),
         )
         dr.eval(gain, rows)
-        result[batch.part] = to_numpy(rows).reshape(-1, batch.split, lamps, 3).sum(axis=1)
+        result[batch.part] = batch.collect_rows(rows, lamps, 3)
     return result / np.float32(paths.samples)
 
 

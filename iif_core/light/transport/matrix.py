@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
 from iif_core.light.environment import solid_angles
-from iif_core.light.transport.arrays import batches, checked_points, on_device, rows_of, to_numpy
+from iif_core.light.transport.arrays import batches, checked_points, on_device, rows_of
 from iif_core.light.transport.emitters import Emitters, share_of_environment
 from iif_core.light.transport.geometry import Geometry, offset_from
 from iif_core.light.transport.kernels import Vertex, World, incoming, light_by_lobe, scatter_by_lobe
@@ -156,9 +156,7 @@ def transport_matrix(
         for lobe, gain in enumerate(gains):
             cached[batch.part, lobe] = batch.collect(gain) / paths.samples
         if n_groups:
-            # (points, lanes of a point, lobe, group, channel). The lanes of a point are added in a fixed order.
-            summed = to_numpy(rows).reshape(-1, batch.split, 2, n_groups, 3).sum(axis=1)
-            matrix[batch.part] = summed / paths.samples
+            matrix[batch.part] = batch.collect_rows(rows, 2, n_groups, 3) / paths.samples
     return matrix, cached
 
 
