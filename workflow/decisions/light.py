@@ -7,6 +7,7 @@ import numpy as np
 from iif_core.light.emission.search import STEP
 from iif_core.light.emission.sun import SHARP, SunEvidence
 from iif_core.light.emission.translucent import TRANSMITTANCE
+from iif_core.light.unexplained import SIGNIFICANT, Strength
 from workflow.decisions.plan import CACHE_COVERAGE
 from workflow.decisions.record import FORCED, SETTLED, Decision, decision
 
@@ -74,6 +75,14 @@ def denoiser(setting: bool) -> Decision:
     """Describe the denoiser of the re-renderings: paths are few, and nothing is fitted to them."""
     status, reason = (SETTLED, "views are re-rendered by few paths, which are noisy") if setting else (FORCED, "set to off")
     return decision("denoiser", setting, "whether re-renderings have the noise of paths", 1.0, 1.0, reason, status)
+
+
+def unexplained(found: Strength) -> Decision:
+    """Decide whether photographs tell of light that the model lacks (Eq. S.25)."""
+    measure = "share of the squared error of re-renderings that other photographs take away, in standard errors"
+    sure = found.share / found.error if found.error > 0 else 0.0
+    said = f"other photographs of the surface take {found.share:.0%} +- {found.error:.0%} off the squared error of re-renderings"
+    return decision("unexplained_light", bool(found.beta.any()), measure, sure, SIGNIFICANT, said)
 
 
 def radiance_cache(setting: str, coverage: float, censored: float) -> Decision:

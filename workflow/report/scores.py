@@ -21,6 +21,7 @@ VARIANT_NAMES = {
     "photo_nearest": "blend of the nearest photographs",
     "photo_as_albedo": "mean photograph as albedo",
     "base": "base texture (fused)",
+    "corrected": "result, with unexplained light",
     "result": "result",
 }
 

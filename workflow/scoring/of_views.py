@@ -27,6 +27,7 @@ BASELINES = {
     "photo_nearest": "the same by a blend of the nearest photographs",
     "photo_as_albedo": "the mean radiance of each surface cell, at the level of the base, taken for its albedo",
     "base": "the fused base texture, before the fit to the photographs",
+    "corrected": "the re-rendering times the light that the model lacks, as the other photographs show it",
     "result": "what is published",
 }
 """Variant -> what it is."""
@@ -56,6 +57,8 @@ def scores_of_view(
     sensor = np.clip(exposure * photo, 0, 1) if capture.is_hdr else photo
     target = metrics.Target("rgb", sensor, valid & hit, encoded=not capture.is_hdr, networks=networks["rgb"])
     yield "result", view.name, rgb_of, target.scores(rgb(rendered, "ldr"))
+    if (picture := others.corrected(view, rgb(rendered), photo, valid & hit)) is not None:
+        yield "corrected", view.name, rgb_of, target.scores(picture)
     if view.split == "test":
         for variant, picture in others.predictions(view, photo, valid & hit):
             yield variant, view.name, rgb_of, target.scores(picture)

@@ -12,12 +12,13 @@ from iif_core.evaluation.consistency import held_out_gain
 from iif_core.light.emission.sensor import Sensor
 from iif_core.numerics.filling import fill_from_neighbours
 from iif_core.surface.triangles import face_geometry, towards_viewer
-from workflow.artifacts.store import ids_from_disk
+from workflow.artifacts.store import ids_from_disk, rgb
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_base, read_gains
 from workflow.scene.decoded import MEMORY_MB, Kept
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import read_response
+from workflow.scene.unexplained import FOLDER
 
 BLOCK = 1 << 16
 """Pixels that are predicted at once."""
@@ -75,10 +76,19 @@ class OtherPhotographs:
             if np.isfinite(picture).any():
                 yield variant, self._developed(view, fill_from_neighbours(picture)[0], photo, counted)
 
+    def corrected(self, view: View, radiance: np.ndarray, photo: np.ndarray, counted: np.ndarray) -> np.ndarray | None:
+        """Return the sensor values of a re-rendering (H, W, 3) times the light that the model lacks (Eq. S.24); None where no
+        such light is known."""
+        file = f"{FOLDER}/{view.name}.exr"
+        if not self._job.read("render").has(file):
+            return None
+        factor = rgb(self._job.read("render").exr(file)).astype(np.float32)
+        return self._developed(view, factor * radiance, photo, counted)
+
     def _developed(self, view: View, radiance: np.ndarray, photo: np.ndarray, counted: np.ndarray) -> np.ndarray:
-        """Return the sensor values of radiance in a held-out view, as stage render finds those of its re-rendering."""
+        """Return the sensor values of radiance in a view, as stage render finds those of its re-rendering."""
         exposed = self._factor(view) * radiance
-        if self._capture.facts.get("exposure_estimated"):
+        if view.split == "test" and self._capture.facts.get("exposure_estimated"):
             white_balance = bool((self._gains.gain != self._gains.gain[:, :1]).any())
             exposed = exposed * held_out_gain(exposed, photo, counted, self._curve, white_balance)
         return np.clip(self._curve(np.clip(exposed, 0, 1)), 0, 1)

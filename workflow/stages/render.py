@@ -19,6 +19,7 @@ from workflow.scene.fitted_maps import fitted_maps, without_emitters
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.picture_facts import view_attributes
 from workflow.scene.recovered import read_recovered, read_response
+from workflow.scene.unexplained import Unexplained
 
 MAX_BOUNCES = 16  # of a path
 _SEEDS = 0x72656E  # keeps the random streams of this stage apart from those of others
@@ -26,7 +27,7 @@ _SEEDS = 0x72656E  # keeps the random streams of this stage apart from those of 
 
 def run(job: Job) -> None:
     """Write maps/<view>.exr, which is published: the re-rendering, its sensor value, emission and the fitted maps; and
-    held_out.parquet.
+    unexplained/<view>.exr, held_out.parquet.
 
     The sensor value is the re-rendering through the gains of the view and the fitted response, clipped to [0, 1]. A held-out
     photograph of unknown exposure gets the gain with which its own re-rendering is nearest to it, one for each channel where
@@ -50,6 +51,7 @@ def run(job: Job) -> None:
     job.log.info("views are re-rendered by %s", how)
     world = Scene(geometry, material, emitters, cache)
     found: dict[int, np.ndarray] = {}
+    unexplained = Unexplained(job, capture, scene, curve)
     through_holes = job.read("emission").json("emission.json")["escape_share"]["secondary"] > decisions.ESCAPE_OPEN
     white_balance = bool((gains.gain != gains.gain[:, :1]).any())
     for done, view in enumerate(capture.views):
@@ -75,6 +77,8 @@ def run(job: Job) -> None:
         channels = {**split_rgb(radiance), **split_rgb(np.clip(sensor, 0, 1), "ldr")}
         emission = scene.emission_map(face_id, eye)
         channels |= split_rgb(emission, "emission") | without_emitters(fitted, emission.any(-1))
+        if view.split != "test":
+            unexplained.add(view, radiance, factor, emission.any(-1))
         attributes = view_attributes(view, float(factor.mean()))
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative", attributes=attributes)
     if found:
@@ -82,4 +86,8 @@ def run(job: Job) -> None:
         columns = {"view_id": np.array(list(found), np.int32), **{f"gain_{c}": rows[:, i] for i, c in enumerate("rgb")}}
         job.writer.table("held_out.parquet", columns)
     job.progress(len(capture.views), len(capture.views), "views re-rendered")
-    job.writer.json("render.json", {"paths": how, "plan": [decisions.denoiser(job.settings.render.denoise)]})
+    strength, decision = unexplained.write()
+    job.log.info("unexplained light: %s", decision["reason"])
+    facts = {"beta": strength.beta.tolist(), "share": strength.share, "share_error": strength.error}
+    plan = [decisions.denoiser(job.settings.render.denoise), decision]
+    job.writer.json("render.json", {"paths": how, "unexplained": facts, "plan": plan})
