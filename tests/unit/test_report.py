@@ -496,6 +496,7 @@ def test_plan_is_collected(toy):
         ("metallic", False, "settled", "base"),  # as a later stage settled it
         ("vignetting", False, "settled", "plan"),  # nobody had a reason to try it
         ("denoiser", False, "forced", "render"),
+        ("unexplained_light", False, "settled", "render"),  # two photographs cannot tell
     ]
     words = {item["component"]: item.get("override") for item in plan["components"]}
     assert words["denoiser"] == "components: {denoiser: on}" and words["vignetting"] is None

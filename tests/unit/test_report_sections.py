@@ -49,11 +49,17 @@ def test_the_headline_says_what_was_scored():
     means["object_mean"] = {"albedo": {"scaled": {"psnr": {"mean": 21.5}}}}
     text = scores.headline({"means": means, "gain_over_raw_predictions": gain}, has_lamps=True, has_truth=True)
     assert text.endswith("4.2 dB above predictions; one flat colour per object, the mean of its predictions, reaches 21.5 dB.")
+    means["corrected"] = {"rgb": {"raw": {"psnr": {"mean": 26.5}}}}
+    text = scores.headline({"means": means}, has_lamps=True, has_truth=False)
+    assert "as the other photographs show it: 26.5 dB." in text and "photographs: 22.0 dB. " in text
+    means["corrected"]["rgb_held_out"] = {"raw": {"psnr": {"mean": 22.8}}}
+    text = scores.headline({"means": means}, has_lamps=True, has_truth=False)
+    assert "photographs: 22.0 dB, with that light 22.8 dB. " in text
     rivals = {"photo_mean": 23.4, "photo_nearest": 25.6}
     means |= {name: {"rgb_held_out": {"raw": {"psnr": {"mean": mean, "views": 2}}}} for name, mean in rivals.items()}
     means["photo_as_albedo"] = {"albedo": {"scaled": {"psnr": {"mean": 19.1}}}}
     text = scores.headline({"means": means, "gain_over_raw_predictions": gain}, has_lamps=True, has_truth=True)
-    assert "22.0 dB. The mean of the other photographs, with no model of light, reaches 23.4 dB," in text and "25.6 dB" in text
+    assert "22.8 dB. The mean of the other photographs, with no model of light, reaches 23.4 dB," in text and "25.6 dB" in text
     assert text.endswith("; the mean photograph, taken for albedo, 19.1 dB.")
     assert scores.headline({"means": {}}, has_lamps=True, has_truth=True) == ""
 

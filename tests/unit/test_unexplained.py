@@ -122,3 +122,107 @@ def test_extremes():
     )  # as its object
     with refused("finite"):
         light.add(EYES[0], np.array([0]), np.full((1, 3), np.nan), np.ones((1, 3)))
+
+
+# ---------------------------------------------------------------------------------------------------- what stage render writes
+
+SIZE = 32
+"""Pixels of a picture of the wall; each shows four cells."""
+
+
+class Files:
+    """A base that knows the cells of every picture but one, and a writer."""
+
+    def __init__(self):
+        self.written = {}
+        self.cells = (np.arange(SIZE)[:, None] * 2 * 64 + np.arange(SIZE) * 2).astype(np.uint32)
+
+    def has(self, name):
+        return "unknown" not in name
+
+    def exr(self, name, channels=None, units=""):
+        if channels is None:
+            return {"cell.id": self.cells}
+        self.written[name] = np.stack([channels[c] for c in "RGB"], -1)
+
+
+@pytest.fixture
+def stage(monkeypatch):
+    """`Unexplained` of six photographs of a wall that is re-rendered with .2; its second object shows 1.4 times as much, and a lamp
+    and a saturated corner far more."""
+    from types import SimpleNamespace
+
+    from iif_core.camera.response import response
+    from workflow.scene import unexplained as of_stage
+
+    files, curve = Files(), response("srgb")
+    monkeypatch.setattr(of_stage, "read_base", lambda job: files)
+    ijk, owner, centre = wall()
+    names = ["used"] * 6 + ["test", "unknown"]
+    pose = [np.vstack([np.hstack([np.eye(3), eye[:, None]]), [0, 0, 0, 1]]) for eye in EYES]
+    views = [
+        SimpleNamespace(view_id=i, name=f"{name}{i}", world_from_camera=pose[i], width=SIZE, height=SIZE)
+        for i, name in enumerate(names)
+    ]
+    shown = 0.2 * np.where(owner[files.cells] == 1, 1.4, 1.0)[..., None] * np.ones(3)
+    emits = np.zeros((SIZE, SIZE), bool)
+    emits[:4, :4], shown[:4, :4], shown[-3:, -3:] = True, 0.9, 5.0
+    photo = np.clip(curve(np.clip(0.5 * shown, 0, 1)), 0, 1)
+
+    def photograph(view):
+        assert view.name.startswith(("used", "unknown")), "held out"
+        return photo, np.ones((SIZE, SIZE), bool)
+
+    capture = SimpleNamespace(photo=photograph, views=views, is_hdr=False)
+    scene = SimpleNamespace(surface=SimpleNamespace(cell_ijk=ijk, cell_object=owner), cell_centres=centre)
+    found = of_stage.Unexplained(SimpleNamespace(writer=files), capture, scene, curve)
+    return SimpleNamespace(found=found, views=views, emits=emits, files=files, owner=owner[files.cells])
+
+
+def test_stage_render_writes_a_factor_for_every_view(stage):
+    flat = np.full((SIZE, SIZE, 3), 0.2)
+    for view in stage.views[:6] + stage.views[7:]:
+        stage.found.add(view, flat, np.full((SIZE, SIZE, 3), 0.5), stage.emits)
+    strength, decision = stage.found.write()
+    assert decision["included"] and decision["component"] == "unexplained_light" and strength.share > 0.99
+    assert set(stage.files.written) == {f"unexplained/{view.name}.exr" for view in stage.views}
+    # The floor of the logarithms makes the factor a little smaller.
+    floor = 0.02 * (0.2 + 0.28) / 2
+    expected = np.where(stage.owner == 1, (0.28 + floor) / (0.2 + floor), 1.0)[..., None] * np.ones(3)
+    for view in stage.views[:7]:  # the held-out one from all others
+        np.testing.assert_allclose(stage.files.written[f"unexplained/{view.name}.exr"], expected, rtol=3e-3)
+    np.testing.assert_array_equal(stage.files.written["unexplained/unknown7.exr"], 1)
+
+
+def test_without_unexplained_light_nothing_is_written(stage):
+    flat = np.full((SIZE, SIZE, 3), 0.2)
+    for view in stage.views[:2]:
+        stage.found.add(view, flat, np.full((SIZE, SIZE, 3), 0.5), stage.emits)
+    strength, decision = stage.found.write()
+    assert not decision["included"] and not strength.beta.any() and not stage.files.written
+    stage.found.add(stage.views[2], flat, np.full((SIZE, SIZE, 3), 50.0), stage.emits)  # nothing of it is below saturation
+    assert not stage.found.write()[1]["included"]
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_a_corrected_rerendering_is_scored_as_the_rerendering_is(split):
+    """Radiance times factor, through gain and response; only a held-out photograph of unknown exposure gets a gain of its own."""
+    from types import SimpleNamespace
+
+    from iif_core.camera.response import response
+    from workflow.scoring.rivals import OtherPhotographs
+
+    curve, factor = response("srgb"), np.array([1.5, 1.0, 0.5], np.float32)
+    radiance = RNG.uniform(0.1, 0.4, (12, 12, 3)).astype(np.float32)
+    photo = curve(1.2 * 0.8 * factor * radiance)
+    files = {"unexplained/a.exr": {c: np.full((12, 12), f, np.float16) for c, f in zip("RGB", factor, strict=True)}}
+    others = OtherPhotographs.__new__(OtherPhotographs)
+    others._job = SimpleNamespace(read=lambda stage: SimpleNamespace(has=files.__contains__, exr=files.__getitem__))
+    others._capture, others._curve = SimpleNamespace(facts={"exposure_estimated": True}), curve
+    others._gains = SimpleNamespace(gain=np.ones((1, 3)))
+    others._factor = lambda view: np.full((12, 12, 3), 0.8)
+    view = SimpleNamespace(name="a", split=split)
+    found = others.corrected(view, radiance, photo, np.ones((12, 12), bool))
+    expected = photo if split == "test" else curve(0.8 * factor * radiance)
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+    assert others.corrected(SimpleNamespace(name="b", split=split), radiance, photo, np.ones((12, 12), bool)) is None

@@ -67,9 +67,13 @@ def headline(summary: Mapping[str, Any], has_lamps: bool, has_truth: bool) -> st
     photographs, and albedo to the truth."""
     means = summary["means"]
     psnr, held_out = (found(means, quantity, "raw", "psnr") for quantity in ("rgb", "rgb_held_out"))
+    corrected, corrected_held_out = (found(means, quantity, "raw", "psnr", "corrected") for quantity in ("rgb", "rgb_held_out"))
     text = f"Re-renderings reach {psnr['mean']:.1f} dB PSNR on the photographs (sensor values)." if psnr else ""
+    if corrected:
+        text += f" With the light that the model lacks, as the other photographs show it: {corrected['mean']:.1f} dB."
     if held_out:
-        text += f" On the {held_out['views']} held-out photographs: {held_out['mean']:.1f} dB."
+        text += f" On the {held_out['views']} held-out photographs: {held_out['mean']:.1f} dB"
+        text += f", with that light {corrected_held_out['mean']:.1f} dB." if corrected_held_out else "."
         mean, blend = (found(means, "rgb_held_out", "raw", "psnr", variant) for variant in ("photo_mean", "photo_nearest"))
         if mean and blend:
             text += f" The mean of the other photographs, with no model of light, reaches {mean['mean']:.1f} dB,"

@@ -9,6 +9,7 @@ from workflow.report import pictures as pic
 from workflow.report.page import Picture, Strip, ViewRows
 from workflow.report.reported import Reported
 from workflow.report.views import photograph_and_rerendering, sensor_values
+from workflow.scene import unexplained
 from workflow.scene.normal_form import Truth, View
 from workflow.scene.recovered import Recovered
 
@@ -16,6 +17,8 @@ WIDTH = 448
 """Longest side of a picture of a map."""
 ERROR_RANGE, COVERAGE_RANGE, UNCERTAINTY_RANGE = 0.25, 4.0, 0.2
 """What is shown lightest."""
+UNEXPLAINED_RANGE = 1.0
+"""Stops at both ends of the colours."""
 
 Maps = dict[str, np.ndarray]
 
@@ -41,7 +44,7 @@ def view_rows(scene: Reported, view: View, emission_exposure: float, score: floa
         strips.append(_prediction(channels, photograph))
     elif photograph:
         strips.append(Strip("photograph", [photograph]))
-    strips.append(Strip("checks", _checks(scene, file, sensor, depth, counted)))
+    strips.append(Strip("checks", _checks(scene, view, sensor, depth, counted)))
     captions = [f"{score:.1f} dB"] if score is not None else []
     captions += [f"{view.width} x {view.height}", f"exposure {view.exposure:.3g}"]
     if view.split == "test":
@@ -104,9 +107,11 @@ def _prediction(channels: Maps, photograph: Picture | None) -> Strip:
     return Strip("raw prediction", [photograph, *first, apart])
 
 
-def _checks(scene: Reported, file: str, sensor: np.ndarray, depth: np.ndarray, counted: np.ndarray) -> list[Picture]:
-    """Show alignment, objects, selected prediction, uncertainty and base texture of a view, as far as they exist."""
+def _checks(scene: Reported, view: View, sensor: np.ndarray, depth: np.ndarray, counted: np.ndarray) -> list[Picture]:
+    """Show alignment, objects, selected prediction, uncertainty, base texture and unexplained light of a view, as far as they
+    exist."""
     segmentation, base, affines = (scene.readers[stage] for stage in ("segmentation", "base", "affines"))
+    file = f"maps/{view.name}.exr"
     out: list[Picture] = []
     if segmentation.has(file):
         channels = segmentation.exr(file)
@@ -128,4 +133,9 @@ def _checks(scene: Reported, file: str, sensor: np.ndarray, depth: np.ndarray, c
         out.append(_linear("base albedo", rgb(maps, "albedo"), "albedo, linear", "before the fit"))
         shown = pic.scalar(maps["coverage"], 0, COVERAGE_RANGE, mask=counted)
         out.append(_false("coverage", shown, "value", COVERAGE_RANGE, "pixels", "weighted, of the surface cell; 0: filled in"))
+    if (render := scene.readers["render"]).has(lacking := unexplained.name_of(view)):
+        stops = np.log2(rgb(render.exr(lacking)).astype(np.float32)).mean(-1)
+        uri = pic.data_uri(pic.scalar(stops, -UNEXPLAINED_RANGE, UNEXPLAINED_RANGE, mask=counted), True, WIDTH)
+        note = "how much brighter other photographs show the surface than it is re-rendered: light that the model lacks"
+        out.append(Picture("unexplained light", uri, note, "value", -UNEXPLAINED_RANGE, UNEXPLAINED_RANGE, "stops"))
     return out

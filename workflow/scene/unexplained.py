@@ -15,9 +15,13 @@ from workflow.scene.base_scene import read_base
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import Recovered
 
-FOLDER = "unexplained"
 DARKEST = 0.02
 """Added to both radiances before the logarithm, as a share of the mean of the photograph: noise and black tell nothing."""
+
+
+def name_of(view: View) -> str:
+    """Return the file of stage render that holds the factor on the re-rendering of a view, if there is unexplained light."""
+    return f"unexplained/{view.name}.exr"
 
 
 class Unexplained:
@@ -59,5 +63,5 @@ class Unexplained:
             known = cell >= 0
             own = self._added.get(view.view_id)
             factor[known] = self._light.factor(view.world_from_camera[:3, 3], cell[known], strength.beta, own)
-            self._job.writer.exr(f"{FOLDER}/{view.name}.exr", split_rgb(factor, dtype=np.float16), "factor")
+            self._job.writer.exr(name_of(view), split_rgb(factor, dtype=np.float16), "factor")
         return strength, decide(strength)

@@ -18,7 +18,7 @@ from workflow.scene.base_scene import read_base, read_gains
 from workflow.scene.decoded import MEMORY_MB, Kept
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import read_response
-from workflow.scene.unexplained import FOLDER
+from workflow.scene.unexplained import name_of
 
 BLOCK = 1 << 16
 """Pixels that are predicted at once."""
@@ -79,10 +79,10 @@ class OtherPhotographs:
     def corrected(self, view: View, radiance: np.ndarray, photo: np.ndarray, counted: np.ndarray) -> np.ndarray | None:
         """Return the sensor values of a re-rendering (H, W, 3) times the light that the model lacks (Eq. S.24); None where no
         such light is known."""
-        file = f"{FOLDER}/{view.name}.exr"
-        if not self._job.read("render").has(file):
+        render = self._job.read("render")
+        if not render.has(name_of(view)):
             return None
-        factor = rgb(self._job.read("render").exr(file)).astype(np.float32)
+        factor = rgb(render.exr(name_of(view))).astype(np.float32)
         return self._developed(view, factor * radiance, photo, counted)
 
     def _developed(self, view: View, radiance: np.ndarray, photo: np.ndarray, counted: np.ndarray) -> np.ndarray:
