@@ -148,8 +148,8 @@ class Files:
 
 @pytest.fixture
 def stage(monkeypatch):
-    """`Unexplained` of six photographs of a wall that is re-rendered with .2; its second object shows 1.4 times as much, and a lamp
-    and a saturated corner far more."""
+    """`Unexplained` of six photographs of a wall that is re-rendered with .2. Its second object shows 1.4 times as much, and a
+    lamp and a saturated corner far more."""
     from types import SimpleNamespace
 
     from iif_core.camera.response import response
