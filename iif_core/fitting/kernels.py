@@ -9,18 +9,19 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from iif_core.numerics.compiled import njit
 
 PIECE = 64
 """Pixels whose Jacobian columns are held together (`_Piece`)."""
 # Reassociation lets the compiler turn a sum over pixels into vector sums. Without `nnan` and `ninf`, a sum that is not finite
 # stays so, and the comparisons that accept a step refuse it.
 _MATHS = {"reassoc", "contract", "nsz", "arcp"}
-_compiled = numba.njit(nogil=True, cache=True, fastmath=_MATHS)
+_compiled = njit(fastmath=_MATHS)
 # Functions that other loops call are inlined: docs/method/numerics.md#sums-that-depend-on-the-compiler.
-_inlined = numba.njit(nogil=True, cache=True, fastmath=_MATHS, forceinline=True)
+_inlined = njit(fastmath=_MATHS, forceinline=True)
 
 
 class PixelArrays(NamedTuple):

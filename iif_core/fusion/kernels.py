@@ -10,21 +10,22 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numba import types
 from numba.extending import overload
 from numpy.typing import NDArray
 
+from iif_core.numerics.compiled import njit
+
 # Pixels that are summed in float32 at a time, and the length of all scratch arrays.
 PIECE = 256
 _MATHS = {"reassoc", "contract", "nsz", "arcp"}  # no assumption about NaN or infinity
-_compiled = numba.njit(nogil=True, cache=True, fastmath=_MATHS)
+_compiled = njit(fastmath=_MATHS)
 # Without reassociation, so that `add_to_cells` adds the pixels in their order.
-_exact = numba.njit(nogil=True, cache=True)
+_exact = njit()
 # Loops that other loops call are inlined: docs/method/numerics.md#sums-that-depend-on-the-compiler.
-_inlined = numba.njit(nogil=True, cache=True, fastmath=_MATHS, forceinline=True)
-_inlined_exact = numba.njit(nogil=True, cache=True, forceinline=True)
+_inlined = njit(fastmath=_MATHS, forceinline=True)
+_inlined_exact = njit(forceinline=True)
 
 GRAM = 14
 """Number of sums of `gram`: aa ab ac bb bc cc a b c (albedo), rr r, mm m, 1."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from iif_core.numerics.compiled import njit
 
 Array = np.ndarray
 
@@ -26,7 +27,7 @@ def correlate(image: Array, vertical: Array, horizontal: Array, border: str = "e
     return _correlate(padded, np.asarray(vertical, image.dtype), np.asarray(horizontal, image.dtype))
 
 
-@numba.njit(nogil=True, cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _correlate(padded, vertical, horizontal):
     taps = len(vertical)
     height, width = padded.shape[0] - taps + 1, padded.shape[1] - taps + 1

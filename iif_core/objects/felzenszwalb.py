@@ -6,12 +6,12 @@ Edges of the graph are shared edges of the mesh (Eq. O.5), taken from the lighte
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
 from iif_core.numerics.arrays import numbered_by_first
+from iif_core.numerics.compiled import njit
 from iif_core.surface.segments import face_adjacency
 from iif_core.surface.triangles import face_geometry
 
@@ -143,7 +143,7 @@ def merge_regions(
     return numbered_by_first(parent)
 
 
-@numba.njit(nogil=True, cache=True)
+@njit()
 def _merged(count, first, second, weight, scale, min_size, fill):
     """Find the root of every node: union-find with path halving over the sorted edges, and a second pass for small regions.
     `fill` is overwritten."""

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from iif_core.numerics.compiled import njit
 
 QUANTILES = (0.2, 0.5, 0.8, 1.0)
 DEPTH_TOLERANCE = (0.012, 0.004)
@@ -20,7 +21,7 @@ NORMAL_COSINE = 0.8
 NEAREST = 0.05
 """z-depth in metres below which a point is too close to a camera to be found in its picture."""
 
-_compiled = numba.njit(nogil=True, cache=True)
+_compiled = njit()
 
 
 LOG_STEPS, NORMAL_STEPS = 1024.0, 127.0

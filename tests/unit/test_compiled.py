@@ -10,12 +10,16 @@ import os
 import pkgutil
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from numba.core.caching import IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
 import iif_core
 import lab.published
+from iif_core.numerics.compiled import LockedCacheFile
 
 PROGRAM = """
 import hashlib
@@ -71,3 +75,38 @@ def test_fresh_and_cached_code_give_the_same_bytes(tmp_path):
         for _ in range(2)
     ]
     assert run[0] == run[1]
+
+
+@pytest.mark.parametrize("locked", [True, False])
+def test_two_processes_may_compile_one_function_at_a_time(tmp_path, monkeypatch, locked):
+    """For different types: without the lock, both choose the same file, and one finds there what is the other's (numba #4807)."""
+    plain = IndexDataCacheFile._load_index
+
+    def slowly(self):
+        found = plain(self)
+        time.sleep(0.2)
+        return found
+
+    monkeypatch.setattr(IndexDataCacheFile, "_load_index", slowly)
+    kind = LockedCacheFile if locked else IndexDataCacheFile
+    first, second = (kind(str(tmp_path), "f", "stamp") for _ in range(2))
+    with ThreadPoolExecutor(
+        2
+    ) as pool:  # a lock of flock() belongs to an opened file, so threads exclude each other like processes
+        list(pool.map(lambda own: own[0].save(*own[1:]), [(first, "int", b"of int"), (second, "float", b"of float")]))
+    found = kind(str(tmp_path), "f", "stamp")
+    assert ([found.load("int"), found.load("float")] == [b"of int", b"of float"]) == locked
+
+
+def test_the_cache_of_a_read_only_checkout_is_read(tmp_path, monkeypatch):
+    LockedCacheFile(str(tmp_path), "f", "stamp").save("int", b"of int")
+
+    def refuse(*arguments):
+        raise PermissionError(arguments)
+
+    monkeypatch.setattr(os, "open", refuse)
+    assert LockedCacheFile(str(tmp_path), "f", "stamp").load("int") == b"of int"
+
+
+def test_every_kernel_has_a_locked_cache():
+    assert [name for name, _, value in _compiled() if not isinstance(value._cache._cache_file, LockedCacheFile)] == []

@@ -14,8 +14,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from iif_core.numerics.compiled import njit
 
 BLOCK = 512  # samples; inputs, hidden values and derivatives of one block stay in a second-level cache of 1 MB
 TILE = 4  # rows and columns of a register tile in the matrix products
@@ -26,7 +27,7 @@ _ONE = np.uint64(1)
 _PRIME_Y = np.uint64(2654435761)
 _PRIME_Z = np.uint64(805459861)
 _TOP = np.float32(1 - 1e-6)
-_kernel = {"nogil": True, "cache": True, "error_model": "numpy"}
+_kernel = {"error_model": "numpy"}
 _exact = {**_kernel, "fastmath": {"contract", "nsz"}}
 _sums = {**_kernel, "fastmath": {"contract", "nsz", "reassoc"}}
 # Loops that other loops call are inlined: docs/method/numerics.md#sums-that-depend-on-the-compiler.

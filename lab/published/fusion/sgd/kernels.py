@@ -9,20 +9,20 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numba import types
 from numba.extending import overload
 from numpy.typing import NDArray
 
 from iif_core.fusion.kernels import sorting_network
+from iif_core.numerics.compiled import njit
 from iif_core.reflectance.material import LOWEST
 
 TILE = 64
-_kernel = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+_kernel = njit(error_model="numpy", fastmath={"contract", "nsz"})
 # Loops that other loops call are inlined: docs/method/numerics.md#sums-that-depend-on-the-compiler.
-_inlined = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
-_sums = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"}, forceinline=True)
+_inlined = njit(error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+_sums = njit(error_model="numpy", fastmath={"contract", "nsz", "reassoc"}, forceinline=True)
 
 LOCATION = np.array([0, 1, 2, 6, 8])
 """Raw outputs that hold the location of each channel (Eq. F.50)."""
