@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 
 from iif_core.camera.pixels import pixel_gains, pixel_steps
-from iif_core.errors import InputError
 from iif_core.evaluation.consistency import held_out_gain
 from workflow.artifacts.store import rgb, split_rgb
 from workflow.decisions import light as decisions
@@ -63,8 +62,6 @@ def run(job: Job) -> None:
         paths = PathOptions(job.settings.render.samples, MAX_BOUNCES, seed)
         jitter = pixel_steps(view, face_id, through_holes)
         radiance = render(world, eye, view.directions().reshape(-1, 3), paths, jitter).reshape(view.height, view.width, 3)
-        if not np.isfinite(radiance).all():
-            raise InputError(f"view {view.name}: re-rendered radiance is not finite; please report it with the scene")
         if job.settings.render.denoise:
             albedo = rgb(fitted, "albedo") if "albedo.R" in fitted else np.zeros_like(radiance)
             radiance = denoise(radiance, albedo, scene.surface.seen_normals(face_id, eye))

@@ -92,6 +92,7 @@ def render_lamps(
 
     Raises:
         InputError: wrong shapes, non-finite numbers, lamps out of range.
+        TransportError: light that is not finite.
     """
     count = len(np.asarray(directions))
     shape = (count, 3)

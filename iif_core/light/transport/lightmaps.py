@@ -181,6 +181,7 @@ def light_maps(
 
     Raises:
         InputError: wrong shapes, non-finite numbers, lamps out of range.
+        TransportError: light that is not finite.
     """
     points, normals, _ = checked_points(points, normals, normals)
     of_face = on_device(checked_lamps(scene, lamp_of_face, lamps, environment_lamp), mi.Int32)

@@ -120,6 +120,7 @@ def transport_matrix(
 
     Raises:
         InputError: wrong shapes, non-finite numbers, column numbers out of range.
+        TransportError: light that is not finite.
     """
     # -------- inputs, with materials moved into their range --------
     position, normals, wo = checked_points(points.points, points.normals, points.wo)

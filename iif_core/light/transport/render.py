@@ -69,6 +69,7 @@ def render(
 
     Raises:
         InputError: wrong shapes, non-finite numbers, a zero direction.
+        TransportError: light that is not finite.
     """
     directions = np.asarray(directions, np.float32)
     directions = rows_of(directions, len(directions), 3, "directions")

@@ -140,6 +140,7 @@ def shading_caches(
 
     Raises:
         InputError: wrong shapes, non-finite numbers, levels that do not increase or lie outside the range.
+        TransportError: light that is not finite.
     """
     levels = np.asarray(levels, np.float64).reshape(-1)
     if levels.size and not (levels.min() >= R_MIN - 1e-6 and levels.max() <= 1 + 1e-6 and (np.diff(levels) > 0).all()):
