@@ -57,6 +57,8 @@ _PAIRS = (("min", "max"), ("minimum", "maximum"), ("argmin", "argmax"), ("floor"
 _NAMES = dict([*_PAIRS, *(pair[::-1] for pair in _PAIRS)])
 _SYMMETRIC = re.compile(r"(.*\.)?(minimum|maximum|min|max|hypot|isinstance|zip)")
 _LATE = "time limit"
+KERNELS = (b"numba", b"numerics.compiled")
+"""What the source of compiled kernels imports; their cache may not be shared with other mutants."""
 _SAID = re.compile(r".*\b(log|logging|warnings|notes|progress)\b(\.\w+)?")
 
 
@@ -188,7 +190,7 @@ class Bench:
         if not files:
             return "survived", "no unit test imports it", 0.0
         source = path.read_bytes()
-        changed, kernels = mutant.of(source), b"numba" in source
+        changed, kernels = mutant.of(source), any(word in source for word in KERNELS)
         try:
             failed, seconds = self._run(path, changed, files, kernels, SOON)
             if failed == _LATE:  # only then it matters what the tests take without it

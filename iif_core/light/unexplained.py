@@ -1,39 +1,48 @@
-"""Light that the model lacks, as photographs show it: the logarithm of what surface shows over how it is re-rendered, as means
-over nested blocks of surface (docs/method/shading.md#unexplained-light).
+"""What re-renderings lack, as photographs agree on it: light that was not found, above all. The logarithm of what surface shows
+over how it is re-rendered, on nested blocks of surface (docs/method/shading.md#unexplained-light).
 
-It belongs to the light under which the photographs were taken and to no material. Other cameras can see it; it cannot be relit.
+It belongs to the light under which the photographs were taken. Other cameras can see it; it cannot be relit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear
 
 from iif_core.errors import InputError
 
-EDGES = (16, 4)
-"""Edges of the blocks in surface cells; the coarsest block is the object."""
+EDGE = 4
+"""Edge of the smallest blocks in surface cells, of photographs of up to `PIXELS`. That of larger ones grows with their sides:
+what is lacking is smooth."""
+PIXELS = 1 << 16
+STEP = 4
+"""Ratio of the edges of the larger blocks and of the smallest ones; the largest block of all is the object."""
 NEAREST = 4
 """Photographs of which a block takes the blend of the nearest."""
 FULL = 4.0
 """Pixels of a block from which on a photograph counts in full."""
 LARGEST = 2.0
-"""Largest |log| that a pixel may add; beyond it surface and re-rendering are not the same thing."""
+"""Largest |log|; beyond it surface and re-rendering are not the same thing."""
 SIGNIFICANT = 2.0
 """Standard errors by which it must bring photographs nearer that it was not made of."""
-MIN_VIEWS = 3
-_LEAST_ANGLE = 1e-3  # radians
+MIN_VIEWS = 5
+"""Photographs from which on the standard error over them means something."""
+MOST_VIEWS = 32
+"""Photographs, evenly spread, by which the strength is found; all of them tell what is lacking."""
+TERMS = 5
+_LEAST_ANGLE = 1e-6  # radians; the photograph from the same place has all of the weight
+_RIDGE = 1e-6
 
 
 class Blocks(NamedTuple):
-    """Nested blocks of surface cells, each level within the one before: objects, then `EDGES`.
+    """Nested blocks of surface cells, each level within the one before: objects, large blocks, small blocks.
 
     Attributes:
-        of_cell: (L, C) block of every cell at every level; parent: (L, B) block of every finest block, of which there are B.
+        of_cell: (3, C) block of every cell at every level; parent: (3, B) block of every small block, of which there are B.
         centre: (B_l, 3) metres of the blocks of each level.
     """
 
@@ -42,49 +51,55 @@ class Blocks(NamedTuple):
     centre: tuple[NDArray, ...]
 
 
-def nested_blocks(ijk: NDArray, object_id: NDArray, centre: NDArray) -> Blocks:
-    """Group surface cells by object, and within objects by their place; ijk (C, 3) int, object_id (C,), centre (C, 3) metres."""
-    keys = [object_id[:, None], *(np.concatenate([object_id[:, None], ijk // edge], 1) for edge in EDGES)]
-    of_cell = np.stack([np.unique(key, axis=0, return_inverse=True)[1].ravel() for key in keys])
+def nested_blocks(ijk: NDArray, object_id: NDArray, centre: NDArray, pixels: float = PIXELS) -> Blocks:
+    """Group surface cells by object, and within objects by their place.
+
+    Args:
+        ijk: (C, 3) int; object_id: (C,); centre: (C, 3) metres.
+        pixels: of a photograph, mean.
+    """
+    small = EDGE * max(1, int(np.ceil(np.sqrt(pixels / PIXELS))))
+    keys = [object_id[:, None], *(np.concatenate([object_id[:, None], ijk // edge], 1) for edge in (STEP * small, small))]
+    of_cell = np.stack([np.unique(key, axis=0, return_inverse=True)[1].ravel() for key in keys]).astype(np.int32)
     centres = []
     for own in of_cell:
         count = np.bincount(own)
         centres.append(np.stack([np.bincount(own, centre[:, axis]) for axis in range(3)], 1) / count[:, None])
-    parent = np.zeros((len(keys), len(centres[-1])), np.int64)
+    parent = np.zeros((len(keys), len(centres[-1])), np.int32)
     parent[:, of_cell[-1]] = of_cell
     return Blocks(of_cell, parent, tuple(centres))
 
 
 class _Shown(NamedTuple):
-    """What one photograph shows of the blocks of one level: block (n,) ascending, mean log ratio (n, 3), and weight (n,)."""
+    """What one photograph shows of the blocks of one level: block (n,) ascending, log ratio (n, 3), how far it counts (n,)."""
 
     block: NDArray
-    mean: NDArray
-    weight: NDArray
+    ratio: NDArray
+    count: NDArray
 
 
 class _View(NamedTuple):
-    """One photograph: eye (3,); levels; and of its finest blocks the sums of w, w r and w r^2 over pixels, (n, 3)."""
+    """One photograph: eye (3,); levels; and the weight (n, 3) of its small blocks."""
 
     eye: NDArray
     levels: tuple[_Shown, ...]
     weight: NDArray
-    weighted: NDArray
-    square: NDArray
 
 
 class Strength(NamedTuple):
-    """How far the means of other photographs are believed.
+    """How far what the other photographs show is believed.
 
     Attributes:
-        beta: (5,) >= 0, of the terms of Eq. S.24; all 0 if they do not help.
-        share: of the squared error of photographs that the others take away, to first order in the logarithm; error: its standard
-            error over photographs.
+        beta: (5,) in [0, 1], of the terms of Eq. S.24; all 0 if they do not help.
+        share: of the squared error of blocks that the other photographs take away, to first order in the logarithm; error: its
+            standard error over photographs.
+        views: photographs by which it was found; 0 if they are too few.
     """
 
     beta: NDArray
     share: float
     error: float
+    views: int
 
 
 class UnexplainedLight:
@@ -95,93 +110,97 @@ class UnexplainedLight:
         self.views: list[_View] = []
         sizes = [len(centre) for centre in blocks.centre]
         self._sums = [np.zeros((size, 3)) for size in sizes]
-        self._weights = [np.zeros(size) for size in sizes]
+        self._counts = [np.zeros(size) for size in sizes]
 
-    def add(self, eye: NDArray, cell: NDArray, log_ratio: NDArray, weight: NDArray) -> None:
+    def add(self, eye: NDArray, cell: NDArray, shown: NDArray, rendered: NDArray, weight: NDArray) -> None:
         """Add a photograph.
 
         Args:
             eye: (3,) metres, its place.
             cell: (n,) surface cell of each of its pixels.
-            log_ratio: (n, 3) log of what it shows over its re-rendering, finite.
+            shown, rendered: (n, 3) radiance of the photograph and of its re-rendering, > 0.
             weight: (n, 3) >= 0, squared change of the sensor value with the logarithm of the radiance.
 
         Raises:
-            InputError: a ratio or a weight that is not finite.
+            InputError: radiance that is not finite and positive, or a weight that is not finite and >= 0.
         """
-        if not (np.isfinite(log_ratio).all() and np.isfinite(weight).all()):
-            raise InputError("unexplained light: ratios and weights must be finite; leave pixels without them out")
-        ratio, levels = np.clip(log_ratio, -LARGEST, LARGEST), []
-        for of_cell, sums, total in zip(self.blocks.of_cell, self._sums, self._weights, strict=True):
+        radiance = np.concatenate([shown, rendered])
+        if not (np.isfinite(radiance).all() and (radiance > 0).all() and np.isfinite(weight).all() and (weight >= 0).all()):
+            raise InputError("unexplained light: radiance must be finite and positive, weights finite; leave other pixels out")
+        levels = []
+        for of_cell, sums, total in zip(self.blocks.of_cell, self._sums, self._counts, strict=True):
             block, row, pixels = np.unique(of_cell[cell], return_inverse=True, return_counts=True)
-            own = np.minimum(pixels, FULL)
-            shown = _Shown(block, _sums(row, ratio, len(block)) / pixels[:, None], own)
-            sums[block] += own[:, None] * shown.mean
-            total[block] += own
-            levels.append(shown)
-        last = len(levels[-1].block)  # the rows of the finest level are those of the last turn
-        moments = (_sums(row, values, last) for values in (weight, weight * ratio, weight * ratio**2))
-        self.views.append(_View(np.asarray(eye, np.float64), tuple(levels), *moments))
+            # The logarithm of sums, not the sum of logarithms, which the noise of a re-rendering would bias.
+            ratio = np.log(_sums(row, shown, len(block))) - np.log(_sums(row, rendered, len(block)))
+            own = _Shown(block, np.clip(ratio, -LARGEST, LARGEST).astype(np.float32), np.minimum(pixels, FULL).astype(np.float32))
+            sums[block] += own.count[:, None] * own.ratio.astype(np.float64)
+            total[block] += own.count
+            levels.append(own)
+        # The rows of the last level are those of the small blocks.
+        self.views.append(_View(np.asarray(eye, np.float64), tuple(levels), _sums(row, weight, len(block)).astype(np.float32)))
 
     def terms(self, eye: NDArray, block: NDArray, without: int | None = None) -> NDArray:
-        """Return the five terms of Eq. S.24 for finest blocks (n,) seen from a place, (n, 3, 5); `without` a photograph."""
-        coarse = np.zeros((len(block), 3))
+        """Return the terms of Eq. S.24 for small blocks (n,) seen from a place, (n, 3, 5); `without` a photograph."""
         terms, blends = [], []
+        coarse = np.zeros((len(block), 3))
         for level, centre in enumerate(self.blocks.centre):
-            own = self.blocks.parent[level][block]
+            own, row = np.unique(self.blocks.parent[level][block], return_inverse=True)
             mean, known = self._mean(level, own, without)
-            mean = np.where(known[:, None], mean, coarse)  # what no photograph shows is as the larger block around it
+            mean = np.where(known[row, None], mean[row], coarse)  # what no photograph shows is as the larger block around it
             terms.append(mean - coarse)
             coarse = mean
             if level:
                 blend, found = self._nearest(level, own, eye - centre[own], centre[own], without)
-                blends.append(np.where(found[:, None], blend - mean, 0.0))
-        terms += [blends[0], *(fine - wide for wide, fine in zip(blends[:-1], blends[1:], strict=True))]
+                around = blends[-1] if blends else np.zeros((len(block), 3))
+                blends.append(np.where(found[row, None], blend[row] - mean, around))
+        terms += [blends[0], blends[1] - blends[0]]
         return np.stack(terms, -1)
 
     def _mean(self, level: int, block: NDArray, without: int | None) -> tuple[NDArray, NDArray]:
         """Mean over the photographs (n, 3), and whether any shows the block (n,)."""
-        sums, weight = self._sums[level][block], self._weights[level][block]
+        sums, count = self._sums[level][block], self._counts[level][block]
         if without is not None:
             shown = self.views[without].levels[level]
             row, found = _rows(shown.block, block)
-            sums, weight = sums.copy(), weight.copy()
-            sums[found] -= shown.weight[row, None] * shown.mean[row]
-            weight[found] -= shown.weight[row]
-        known = weight > 0.5  # weights are whole numbers
-        return sums / np.where(known, weight, 1.0)[:, None], known
+            sums[found] -= shown.count[row, None] * shown.ratio[row].astype(np.float64)
+            count[found] -= shown.count[row]
+        known = count > 0.5  # counts are whole numbers
+        return sums / np.where(known, count, 1.0)[:, None], known
 
     def _nearest(
         self, level: int, block: NDArray, towards: NDArray, centre: NDArray, without: int | None
     ) -> tuple[NDArray, NDArray]:
-        """Blend of the photographs that see blocks (n,) from the nearest directions (Eq. E.22), (n, 3); whether there is one."""
-        others = [view for number, view in enumerate(self.views) if number != without]
-        angle = np.full((len(others), len(block)), np.inf, np.float32)
-        value = np.zeros((len(others), len(block), 3), np.float32)
+        """Blend of the photographs that see blocks (n,) from the nearest directions (Eq. E.22), (n, 3), and whether there is one;
+        a single photograph is the mean already."""
+        angle, value = np.full((len(block), NEAREST + 1), np.inf), np.zeros((len(block), NEAREST + 1, 3))
         unit = _unit(towards)
-        for i, view in enumerate(others):
+        for number, view in enumerate(self.views):
+            if number == without:
+                continue
             shown = view.levels[level]
             row, found = _rows(shown.block, block)
             chord = np.linalg.norm(_unit(view.eye - centre[found]) - unit[found], axis=1)
-            angle[i, found] = np.maximum(2 * np.arcsin(np.minimum(chord / 2, 1)), _LEAST_ANGLE)
-            value[i, found] = shown.mean[row]
-        limit = np.full(len(block), np.inf)
-        if len(others) > NEAREST:
-            limit = np.partition(angle, NEAREST, axis=0)[NEAREST].astype(np.float64)
-        limit = np.where(np.isfinite(limit), limit, np.pi)  # too few photographs show the block to leave one out
+            own = 2 * np.arcsin(np.minimum(chord / 2, 1))
+            # The five smallest angles so far: a smaller one takes the place of the largest.
+            place = angle[found].argmax(1)
+            nearer = own < angle[found, place]
+            angle[found[nearer], place[nearer]], value[found[nearer], place[nearer]] = own[nearer], shown.ratio[row[nearer]]
         seen = np.isfinite(angle)
-        weight = np.where(seen, np.maximum(1 - np.where(seen, angle, 0) / limit, 0) / np.where(seen, angle, 1), 0)
-        total = weight.sum(0)
-        return (weight[..., None] * value).sum(0) / np.where(total > 0, total, 1)[:, None], total > 0
+        limit = np.where(seen.all(1), angle.max(1), np.pi)  # too few photographs show the block to leave one out
+        own = np.where(seen, angle, 0.0)
+        weight = seen * np.maximum(1 - own / np.maximum(limit, _LEAST_ANGLE)[:, None], 0) / np.maximum(own, _LEAST_ANGLE)
+        total = weight.sum(1)
+        found = (total > 0) & (seen.sum(1) > 1)
+        return (weight[..., None] * value).sum(1) / np.where(total > 0, total, 1)[:, None], found
 
-    def strength(self) -> Strength:
-        """Find how far to believe the terms: least squares on every photograph by the terms of the others (Eq. S.25).
+    def strength(self, progress: Callable[[int, int], None] = lambda done, of: None) -> Strength:
+        """Find how far to believe the terms: least squares on photographs by the terms of the others (Eq. S.25).
 
-        They count only if photographs come nearer by `SIGNIFICANT` standard errors with a strength that was found without them.
+        They count only if photographs come nearer by `SIGNIFICANT` standard errors with a strength that was fitted to the others.
         """
-        nothing, rows = np.zeros(2 * len(EDGES) + 1), [row for row in self._equations() if row[2] > 0]
+        nothing, rows = np.zeros(TERMS), [row for row in self._equations(progress) if row[2] > 0]
         if len(rows) < MIN_VIEWS:
-            return Strength(nothing, 0.0, 0.0)
+            return Strength(nothing, 0.0, 0.0, 0)
         normal, right, before = (np.array(part) for part in zip(*rows, strict=True))
         taken = np.zeros(len(rows))
         for i in range(len(rows)):
@@ -189,14 +208,18 @@ class UnexplainedLight:
             taken[i] = (2 * beta @ right[i] - beta @ normal[i] @ beta) / before.mean()
         share, error = float(taken.mean()), float(taken.std(ddof=1) / np.sqrt(len(taken)))
         helps = share > 0 and share > SIGNIFICANT * error
-        return Strength(_solved(normal.sum(0), right.sum(0)) if helps else nothing, share, error)
+        return Strength(_solved(normal.sum(0), right.sum(0)) if helps else nothing, share, error, len(rows))
 
-    def _equations(self) -> Iterator[tuple[NDArray, NDArray, float]]:
-        """Normal matrix (5, 5), right-hand side (5,) and sum of squares of each photograph, with the terms of the others."""
-        for number, view in enumerate(self.views):
-            x = self.terms(view.eye, view.levels[-1].block, number)
-            normal = np.einsum("ncp,ncq,nc->pq", x, x, view.weight)
-            yield normal, np.einsum("ncp,nc->p", x, view.weighted), float(view.square.sum())
+    def _equations(self, progress: Callable[[int, int], None]) -> Iterator[tuple[NDArray, NDArray, float]]:
+        """Normal matrix (5, 5), right-hand side (5,) and sum of squares of photographs, with the terms of the others."""
+        chosen = np.unique(np.linspace(0, len(self.views) - 1, min(len(self.views), MOST_VIEWS)).round().astype(int))
+        for done, number in enumerate(chosen):
+            progress(done, len(chosen))
+            view = self.views[number]
+            own, ratio = view.levels[-1], view.levels[-1].ratio.astype(np.float64)
+            x, weight = self.terms(view.eye, own.block, number), view.weight.astype(np.float64)
+            normal = np.einsum("ncp,ncq,nc->pq", x, x, weight)
+            yield normal, np.einsum("ncp,nc->p", x, weight * ratio), float((weight * ratio**2).sum())
 
     def factor(self, eye: NDArray, cell: NDArray, beta: NDArray, without: int | None = None) -> NDArray:
         """Return the factor (n, 3) on the re-rendering of surface cells (n,) that are seen from a place; 1 where beta is 0."""
@@ -207,14 +230,13 @@ class UnexplainedLight:
 
 
 def _solved(normal: NDArray, right: NDArray) -> NDArray:
-    """The strength >= 0 that minimises beta N beta - 2 beta r; a term that no photograph has gets 0."""
-    value, vectors = np.linalg.eigh(normal)
-    keep = value > 1e-10 * max(value.max(), 1e-300)
-    if not keep.any():
+    """The strength in [0, 1] that minimises beta N beta - 2 beta r; 0 of a term that no photograph has."""
+    scale = np.diagonal(normal).max()
+    if scale <= 0:
         return np.zeros(len(right))
-    root = np.sqrt(value[keep])
-    # |R beta - q|^2 with R^T R = N and R^T q = r.
-    return nnls(root[:, None] * vectors[:, keep].T, (vectors[:, keep].T @ right) / root)[0]
+    # A little weight on 0 decides where photographs do not. With N + ridge = R^T R this is |R beta - q|^2, R^T q = r.
+    root = np.linalg.cholesky(normal + _RIDGE * scale * np.eye(len(right))).T
+    return lsq_linear(root, np.linalg.solve(root.T, right), (0.0, 1.0), method="bvls").x
 
 
 def _rows(known: NDArray, wanted: NDArray) -> tuple[NDArray, NDArray]:

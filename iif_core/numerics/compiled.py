@@ -8,6 +8,7 @@ memory that is not there (numba issue 4807). Here a process waits for the other.
 from __future__ import annotations
 
 import fcntl
+import itertools
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -22,7 +23,14 @@ class LockedCacheFile(IndexDataCacheFile):
 
     def save(self, key: Any, data: Any) -> None:
         with self._locked(fcntl.LOCK_EX):
-            super().save(key, data)
+            overloads = self._load_index()
+            taken = set(overloads.values())
+            free = (name for number in itertools.count(1) if (name := self._data_name(number)) not in taken)
+            name = overloads.get(key) or next(free)
+            # Code before index: after a kill in between, the index does not lead to older code.
+            self._save_data(name, data)
+            if key not in overloads:
+                self._save_index({**overloads, key: name})
 
     def load(self, key: Any) -> Any:
         with self._locked(fcntl.LOCK_SH):
@@ -32,7 +40,8 @@ class LockedCacheFile(IndexDataCacheFile):
     def _locked(self, kind: int) -> Iterator[None]:
         file = None
         with suppress(OSError):  # of a folder that is read-only, or a disk without locks
-            file = os.open(f"{self._index_path}.lock", os.O_RDWR | os.O_CREAT, 0o666)
+            access = os.O_RDWR if kind == fcntl.LOCK_EX else os.O_RDONLY
+            file = os.open(f"{self._index_path}.lock", access | os.O_CREAT, 0o666)
             fcntl.flock(file, kind)
         try:
             yield

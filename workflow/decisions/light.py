@@ -80,7 +80,9 @@ def denoiser(setting: bool) -> Decision:
 def unexplained(found: Strength) -> Decision:
     """Decide whether photographs tell of light that the model lacks (Eq. S.25)."""
     measure = "share of the squared error of re-renderings that other photographs take away, in standard errors"
-    sure = found.share / found.error if found.error > 0 else 0.0
+    if not found.views:
+        return decision("unexplained_light", False, measure, 0.0, SIGNIFICANT, "too few photographs show the same surface")
+    sure = found.share / max(found.error, 1e-9)
     said = f"other photographs of the surface take {found.share:.0%} +- {found.error:.0%} off the squared error of re-renderings"
     return decision("unexplained_light", bool(found.beta.any()), measure, sure, SIGNIFICANT, said)
 

@@ -29,39 +29,48 @@ class Unexplained:
 
     def __init__(self, job: Job, capture: CaptureReader, scene: Recovered, curve: Response):
         self._job, self._capture, self._curve, self._base = job, capture, curve, read_base(job)
-        surface = scene.surface
-        self._light = UnexplainedLight(nested_blocks(surface.cell_ijk, surface.cell_object, scene.cell_centres))
-        self._added: dict[int, int] = {}
+        surface, pixels = scene.surface, np.mean([view.width * view.height for view in capture.views])
+        self._light = UnexplainedLight(nested_blocks(surface.cell_ijk, surface.cell_object, scene.cell_centres, pixels))
+        self._number: dict[int, int] = {}  # view -> its place in the collection
+        self._emits: dict[int, np.ndarray] = {}
 
     def _cell(self, view: View) -> np.ndarray:
-        """(H, W) surface cell of the pixels, -1 = none."""
+        """(H, W) surface cell of the pixels that only reflect, -1 = none."""
         file = f"maps/{view.name}.exr"
         if not self._base.has(file):
             return np.full((view.height, view.width), -1, np.int32)
-        return ids_from_disk(self._base.exr(file)["cell.id"])
+        emits = np.unpackbits(self._emits[view.view_id], count=view.height * view.width).reshape(view.height, view.width)
+        return np.where(emits, -1, ids_from_disk(self._base.exr(file)["cell.id"]))
 
     def add(self, view: View, radiance: np.ndarray, factor: np.ndarray, emits: np.ndarray) -> None:
-        """Add a used view: its re-rendering and the factor to the sensor (H, W, 3), and pixels that emit (H, W)."""
+        """Add a view: its re-rendering and the factor to the sensor (H, W, 3), and pixels that emit (H, W). Nothing is read of a
+        held-out photograph."""
+        self._emits[view.view_id] = np.packbits(emits)
+        if view.split == "test":
+            return
         (photo, valid), cell = self._capture.photo(view), self._cell(view)
         shown, bound = Sensor(self._curve, self._capture.is_hdr).radiance(photo, factor)
-        exposed = factor * radiance
-        use = valid & (cell >= 0) & ~emits & ~bound.any(-1) & (exposed < 1).all(-1)
+        # A pixel that is saturated in either picture says little, and only in one direction.
+        use = valid & (cell >= 0) & ~bound.any(-1)
+        if not self._capture.is_hdr:
+            use &= (factor * radiance < 1).all(-1)
         if not use.any():
             return
         least = max(DARKEST * float(shown[use].mean()), np.finfo(np.float32).tiny)
-        ratio = np.log(shown[use] + least) - np.log(radiance[use] + least)
         # A pixel counts by how much its sensor value changes with the logarithm of its radiance, as scores do.
-        slope = exposed[use] * self._curve.evaluate(exposed[use])[1]
-        self._added[view.view_id] = len(self._light.views)
-        self._light.add(view.world_from_camera[:3, 3], cell[use], ratio, slope**2)
+        exposed = np.clip((factor * shown)[use], 0, 1)
+        weight = (exposed * self._curve.evaluate(exposed)[1]) ** 2
+        self._number[view.view_id] = len(self._light.views)
+        self._light.add(view.world_from_camera[:3, 3], cell[use], shown[use] + least, radiance[use] + least, weight)
 
     def write(self) -> tuple[Strength, Decision]:
         """Write unexplained/<view>.exr, if it brings photographs nearer; return how far it is believed, and the decision."""
-        strength = self._light.strength()
-        for view in self._capture.views if strength.beta.any() else ():
+        job, views = self._job, self._capture.views
+        strength = self._light.strength(lambda done, of: job.progress(done, of, "photographs compared for unexplained light"))
+        for done, view in enumerate(views if strength.beta.any() else ()):
+            job.progress(done, len(views), "views with unexplained light")
             cell, factor = self._cell(view), np.ones((view.height, view.width, 3))
-            known = cell >= 0
-            own = self._added.get(view.view_id)
+            known, own = cell >= 0, self._number.get(view.view_id)
             factor[known] = self._light.factor(view.world_from_camera[:3, 3], cell[known], strength.beta, own)
-            self._job.writer.exr(name_of(view), split_rgb(factor, dtype=np.float16), "factor")
+            job.writer.exr(name_of(view), split_rgb(factor, dtype=np.float16), "factor")
         return strength, decide(strength)

@@ -74,7 +74,7 @@ class OtherPhotographs:
             pictures[:, at[part][seen]] = mean[seen], blend[seen]
         for variant, picture in zip(("photo_mean", "photo_nearest"), pictures.reshape(2, *photo.shape), strict=True):
             if np.isfinite(picture).any():
-                yield variant, self._developed(view, fill_from_neighbours(picture)[0], photo, counted)
+                yield variant, self._developed(view, fill_from_neighbours(picture)[0], photo, counted, fitted=True)
 
     def corrected(self, view: View, radiance: np.ndarray, photo: np.ndarray, counted: np.ndarray) -> np.ndarray | None:
         """Return the sensor values of a re-rendering (H, W, 3) times the light that the model lacks (Eq. S.24); None where no
@@ -83,12 +83,13 @@ class OtherPhotographs:
         if not render.has(name_of(view)):
             return None
         factor = rgb(render.exr(name_of(view))).astype(np.float32)
-        return self._developed(view, factor * radiance, photo, counted)
+        return self._developed(view, factor * radiance, photo, counted, fitted=view.split == "test")
 
-    def _developed(self, view: View, radiance: np.ndarray, photo: np.ndarray, counted: np.ndarray) -> np.ndarray:
-        """Return the sensor values of radiance in a view, as stage render finds those of its re-rendering."""
+    def _developed(self, view: View, radiance: np.ndarray, photo: np.ndarray, counted: np.ndarray, fitted: bool) -> np.ndarray:
+        """Return the sensor values of radiance in a view, as stage render finds those of its re-rendering; `fitted`: where
+        exposures are estimated, with the gain that brings it nearest to the photograph."""
         exposed = self._factor(view) * radiance
-        if view.split == "test" and self._capture.facts.get("exposure_estimated"):
+        if fitted and self._capture.facts.get("exposure_estimated"):
             white_balance = bool((self._gains.gain != self._gains.gain[:, :1]).any())
             exposed = exposed * held_out_gain(exposed, photo, counted, self._curve, white_balance)
         return np.clip(self._curve(np.clip(exposed, 0, 1)), 0, 1)

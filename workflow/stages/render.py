@@ -74,8 +74,7 @@ def run(job: Job) -> None:
         channels = {**split_rgb(radiance), **split_rgb(np.clip(sensor, 0, 1), "ldr")}
         emission = scene.emission_map(face_id, eye)
         channels |= split_rgb(emission, "emission") | without_emitters(fitted, emission.any(-1))
-        if view.split != "test":
-            unexplained.add(view, radiance, factor, emission.any(-1))
+        unexplained.add(view, radiance, factor, emission.any(-1))
         attributes = view_attributes(view, float(factor.mean()))
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative", attributes=attributes)
     if found:

@@ -101,7 +101,7 @@ def checked_points(points: ArrayLike, normals: ArrayLike, wo: ArrayLike) -> tupl
 
 
 class TransportError(ArithmeticError):
-    """Traced light is NaN or infinite. The input was checked before, so the fault is ours, a library's or the machine's."""
+    """Traced light is NaN or infinite: radiance near the largest float32, or a fault of ours, of a library or of the machine."""
 
 
 def _finite(light: Array) -> Array:

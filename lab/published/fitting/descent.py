@@ -44,7 +44,7 @@ class PublishedOptions:
 
     def per_epoch(self, pixels: int) -> int:
         """Return the number of steps of an epoch for so many pixels."""
-        return -(-(self.steps or 0) // self.epochs) or -(-pixels // self.batch)
+        return (-(-(self.steps or 0) // self.epochs) or -(-pixels // self.batch)) if pixels else 0
 
 
 @dataclass(frozen=True)
