@@ -136,6 +136,6 @@ def _checks(scene: Reported, view: View, sensor: np.ndarray, depth: np.ndarray, 
     if (render := scene.readers["render"]).has(lacking := unexplained.name_of(view)):
         stops = np.log2(rgb(render.exr(lacking)).astype(np.float32)).mean(-1)
         uri = pic.data_uri(pic.scalar(stops, -UNEXPLAINED_RANGE, UNEXPLAINED_RANGE, mask=counted), True, WIDTH)
-        note = "how much brighter other photographs show the surface than it is re-rendered: light that the model lacks"
+        note = "by how much re-renderings are too dark, as far as other photographs agree on it"
         out.append(Picture("unexplained light", uri, note, "value", -UNEXPLAINED_RANGE, UNEXPLAINED_RANGE, "stops"))
     return out
