@@ -32,7 +32,7 @@ def test_defaults_are_ours_and_those_of_the_solvers():
         POLISH,
     )
     shared = set(type(plain.affines).model_fields) & {field.name for field in fields(SgdOptions)}
-    assert shared == {"epochs", "batch", "rate"}
+    assert shared == {"epochs", "batch", "rate", "steps"}
     assert all(getattr(plain.affines, name) == getattr(SgdOptions(), name) for name in shared)
 
 

@@ -286,6 +286,10 @@ def test_radiance_is_scored_once_against_the_truth_or_a_linear_photograph(monkey
     layers = {"": radiance, "ldr.": image(2), "emission.": 0 * radiance}
     channels = {f"{layer}{c}": picture[..., i] for layer, picture in layers.items() for i, c in enumerate("RGB")}
     reader = SimpleNamespace(exr=lambda file: channels, has=lambda file: False)
+
+    def channels_of(layer):
+        return np.stack([channels[f"{layer}{c}"] for c in "RGB"], -1)
+
     capture = SimpleNamespace(
         is_hdr=is_hdr, photo=lambda view, held_out: (radiance, mask), gbuffer=lambda view: (None, np.zeros(ALL.shape, int))
     )
@@ -294,7 +298,11 @@ def test_radiance_is_scored_once_against_the_truth_or_a_linear_photograph(monkey
     monkeypatch.setattr(of_views, "read_base", lambda job: reader)
     monkeypatch.setattr(of_views, "material_truth", lambda *arguments: materials)
     job, view = SimpleNamespace(read=lambda stage: reader), SimpleNamespace(name="0", split="train")
-    rows = list(of_views.scores_of_view(job, capture, view, 1.0, object(), SimpleNamespace(albedo=None), {"rgb": {}}))
+    others = SimpleNamespace(albedo=None, corrected=lambda view, radiance, photo, counted: 0.5 * channels_of("ldr."))
+    rows = list(of_views.scores_of_view(job, capture, view, 1.0, object(), others, {"rgb": {}}))
+    corrected = [values(scores) for variant, _, quantity, scores in rows if (variant, quantity) == ("corrected", "rgb")]
+    result = [values(scores) for variant, _, quantity, scores in rows if (variant, quantity) == ("result", "rgb")]
+    assert len(corrected) == 1 and corrected[0].keys() == result[0].keys() and corrected != result[:1]
     found = [values(scores) for _, _, quantity, scores in rows if quantity == "rgb" and scores[0].metric == "log_l2"]
     expected = values(m.score_map("emission", radiance, radiance if is_hdr else truth.radiance, mask, metrics=("log_l2",)))
     assert found == [pytest.approx({key: value for key, value in expected.items() if key[1] == "log_l2"})]

@@ -118,7 +118,10 @@ def test_the_rivals_are_seen_from_the_eye_of_the_held_out_view(seen, monkeypatch
     rival = object.__new__(rivals.OtherPhotographs)
     rival._normals = face_geometry(*own.room_mesh()[:2])[0]
     rival._capture = SimpleNamespace(gbuffer=lambda view: seen[view.view_id][1:], used=[view for view, *_ in seen])
-    rival.shown, rival._developed = lambda view: [None, *others][view.view_id], lambda view, radiance, photo, counted: radiance
+    rival.shown, rival._developed = (
+        lambda view: [None, *others][view.view_id],
+        lambda view, radiance, photo, counted, fitted: radiance,
+    )
     photo = np.zeros((*seen[0][1].shape, 3))
     found = dict(rival.predictions(seen[0][0], photo, photo[..., 0] == 0))
     mean, blend, known = by_others(*surface, others)
