@@ -86,23 +86,33 @@ def by_others(
     """
     seen, clean = np.zeros((2, len(others), len(points)), bool)
     value, angle = np.zeros((len(others), len(points), 3), np.float32), np.zeros((len(others), len(points)))
-    towards = _unit(eye - points)
+    towards = unit(eye - points)
     for i, other in enumerate(others):
         seen[i], value[i], bound = other.at(points, normals)
         clean[i] = seen[i] & ~bound
-        chord = np.linalg.norm(_unit(other.camera.world_from_camera[:3, 3] - points) - towards, axis=1)
-        angle[i] = 2 * np.arcsin(np.minimum(chord / 2, 1))
+        angle[i] = angles_between(unit(other.camera.world_from_camera[:3, 3] - points), towards)
     counted = np.where(clean.any(0), clean, seen)
     mean = (counted[..., None] * value).sum(0) / np.maximum(counted.sum(0), 1)[:, None]
     limit = np.full(len(points), np.inf)
     if len(others) > nearest:
         limit = np.partition(np.where(counted, angle, np.inf), nearest, axis=0)[nearest]
     limit = np.where(np.isfinite(limit), limit, np.pi)  # too few photographs show the point to leave one out
-    weight = counted * np.maximum(1 - angle / np.maximum(limit, _LEAST_ANGLE), 0) / np.maximum(angle, _LEAST_ANGLE)
+    weight = counted * blend_weights(angle, limit)
     total = weight.sum(0)
     blend = (weight[..., None] * value).sum(0) / np.where(total > 0, total, 1)[:, None]
     return mean, np.where((total > 0)[:, None], blend, mean), seen.any(0)
 
 
-def _unit(vectors: NDArray) -> NDArray:
+def blend_weights(angle: NDArray, limit: NDArray) -> NDArray:
+    """Weights of the unstructured lumigraph (Eq. E.22) for angles, and the angle from which on a photograph counts nothing."""
+    return np.maximum(1 - angle / np.maximum(limit, _LEAST_ANGLE), 0) / np.maximum(angle, _LEAST_ANGLE)
+
+
+def angles_between(a: NDArray, b: NDArray) -> NDArray:
+    """Angles (n,) in radians between unit vectors (n, 3), exact for small ones."""
+    return 2 * np.arcsin(np.minimum(np.linalg.norm(a - b, axis=1) / 2, 1))
+
+
+def unit(vectors: NDArray) -> NDArray:
+    """Vectors (..., 3) of length 1; 0 stays 0."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from iif_core.camera.interpolation import NEAREST, angles_between, blend_weights, unit
 from iif_core.errors import InputError
 
 EDGE = 4
@@ -21,8 +22,6 @@ what is lacking is smooth."""
 PIXELS = 1 << 16
 STEP = 4
 """Ratio of the edges of the larger blocks and of the smallest ones; the largest block of all is the object."""
-NEAREST = 4
-"""Photographs of which a block takes the blend of the nearest."""
 FULL = 4.0
 """Pixels of a block from which on a photograph counts in full."""
 LARGEST = 2.0
@@ -34,7 +33,6 @@ MIN_VIEWS = 5
 MOST_VIEWS = 32
 """Photographs, evenly spread, by which the strength is found; all of them tell what is lacking."""
 TERMS = 5
-_LEAST_ANGLE = 1e-6  # radians; the photograph from the same place has all of the weight
 _RIDGE = 1e-6
 
 
@@ -173,22 +171,20 @@ class UnexplainedLight:
         """Blend of the photographs that see blocks (n,) from the nearest directions (Eq. E.22), (n, 3), and whether there is one;
         a single photograph is the mean already."""
         angle, value = np.full((len(block), NEAREST + 1), np.inf), np.zeros((len(block), NEAREST + 1, 3))
-        unit = _unit(towards)
+        seen_from = unit(towards)
         for number, view in enumerate(self.views):
             if number == without:
                 continue
             shown = view.levels[level]
             row, found = _rows(shown.block, block)
-            chord = np.linalg.norm(_unit(view.eye - centre[found]) - unit[found], axis=1)
-            own = 2 * np.arcsin(np.minimum(chord / 2, 1))
+            own = angles_between(unit(view.eye - centre[found]), seen_from[found])
             # The five smallest angles so far: a smaller one takes the place of the largest.
             place = angle[found].argmax(1)
             nearer = own < angle[found, place]
             angle[found[nearer], place[nearer]], value[found[nearer], place[nearer]] = own[nearer], shown.ratio[row[nearer]]
         seen = np.isfinite(angle)
         limit = np.where(seen.all(1), angle.max(1), np.pi)  # too few photographs show the block to leave one out
-        own = np.where(seen, angle, 0.0)
-        weight = seen * np.maximum(1 - own / np.maximum(limit, _LEAST_ANGLE)[:, None], 0) / np.maximum(own, _LEAST_ANGLE)
+        weight = seen * blend_weights(np.where(seen, angle, 0.0), limit[:, None])
         total = weight.sum(1)
         found = (total > 0) & (seen.sum(1) > 1)
         return (weight[..., None] * value).sum(1) / np.where(total > 0, total, 1)[:, None], found
@@ -248,7 +244,3 @@ def _rows(known: NDArray, wanted: NDArray) -> tuple[NDArray, NDArray]:
 
 def _sums(row: NDArray, values: NDArray, count: int) -> NDArray:
     return np.stack([np.bincount(row, values[:, channel], count) for channel in range(3)], 1)
-
-
-def _unit(vectors: NDArray) -> NDArray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
