@@ -28,8 +28,6 @@ _ONE_SIGMA = 0.8413447460685429
 """Share of a normal distribution below one standard deviation."""
 _DEGREES_OF_FREEDOM = 4.0
 """Of Student's t of the errors that the fit states (Eq. M.34, M.56)."""
-_PROFILE_ERROR = 0.05
-"""Error of a profiled roughness by the grid of the profile, half its spacing."""
 _SMALLEST, _LARGEST = 1e-6, 30.0
 """Limits of errors, which keep scales finite; an interval is 0 to 1 long before the upper one."""
 _RAREST = 1e-12
@@ -46,13 +44,17 @@ class MeasuredErrors:
     Attributes:
         additive: error of an albedo that does not grow with it; border: the same of an object that one pixel shows, by what its
             borders mix into it, which falls with the root of the pixels; hue: error of the logarithm of a channel relative to
-            the brightness. All are halves of central 68 % intervals.
+            the brightness.
+        dielectric, metal: error of the roughness of what is taken for a non-metal, and for any other kind, that the fit does not
+            state. All these are halves of central 68 % intervals.
         albedo, roughness, metallic: the factor lambda of each.
     """
 
     additive: float
     border: float
     hue: float
+    dielectric: float
+    metal: float
     albedo: float
     roughness: float
     metallic: float
@@ -128,23 +130,50 @@ def mixture_quantile(below: float, weight: NDArray, middle: NDArray, error: NDAr
     return 0.5 * (low + high)
 
 
-def conformal_factor(residual: ArrayLike, weight: ArrayLike, probability: float = PROBABILITY) -> float:
-    """Return the split-conformal quantile of normalised errors (Eq. M.62).
+def conformal_factor(residual: ArrayLike, room: ArrayLike, until: ArrayLike = np.inf, probability: float = PROBABILITY) -> float:
+    """Return the least factor with which claims hold as often as `probability`, by split-conformal prediction (Eq. M.62).
 
-    With equal weights it is the ceil((n + 1) probability)-th smallest of n errors (Vovk et al. 2005): one more object, which
-    weighs as much as the mean of the others, counts as an error without limit.
+    With one room it is the ceil((n + 1) probability)-th smallest of n errors (Vovk et al. 2005): one more object, which weighs as
+    much as the mean of the others, counts as an error without limit. An interval that has grown to all values claims nothing, and
+    counts for nothing.
 
     Args:
-        residual: (n,) >= 0; weight: (n,) > 0.
+        residual: (n,) factors >= 0 with which the intervals just reach the truth.
+        room: (n,) integers >= 0, the room of each object; what is claimed in a room weighs 1 together.
+        until: factors from which on an interval claims nothing, broadcast to (n,).
 
     Returns:
         The factor; infinite where there are too few errors for `probability`.
     """
-    r, w = np.asarray(residual, np.float64), np.asarray(weight, np.float64)
-    order = np.argsort(r)
-    needed = probability * (w.sum() + w.mean()) if len(w) else np.inf
-    enough = np.flatnonzero(np.cumsum(w[order]) >= needed * (1.0 - 1e-12))
-    return float(r[order][enough[0]]) if len(enough) else np.inf
+    r, room = np.asarray(residual, np.float64), np.asarray(room, np.int64)
+    until = np.broadcast_to(np.asarray(until, np.float64), r.shape)
+    claims = np.bincount(room[until > 0], minlength=room.max(initial=-1) + 1).astype(np.float64)
+    held = np.zeros_like(claims)
+    # What happens as the factor grows: an interval reaches its truth, and later on, or before, it ceases to claim anything.
+    reach, end = np.flatnonzero(r < until), np.flatnonzero((until > 0) & np.isfinite(until))
+    at = np.concatenate([r[reach], until[end]])
+    who, change = np.concatenate([reach, end]), np.repeat([1, -1], [len(reach), len(end)])
+    order = np.argsort(at, kind="stable")
+    for k, n in enumerate(order):
+        own = room[who[n]]
+        if change[n] > 0:
+            held[own] += 1
+        else:
+            claims[own] -= 1
+            held[own] -= r[who[n]] < until[who[n]]
+        if k + 1 < len(order) and at[order[k + 1]] == at[n]:
+            continue
+        some = claims > 0
+        needed = probability * some.sum() * (1.0 + 1.0 / max(claims.sum(), 1.0))
+        if some.any() and (held[some] / claims[some]).sum() >= needed * (1.0 - 1e-12):
+            return float(at[n])
+    return np.inf
+
+
+def roughness_error(kinds: Kinds, errors: MeasuredErrors) -> NDArray:
+    """Return the errors (O, 3) of the roughness given each kind: that of its profile, and what was measured (Eq. M.60)."""
+    measured = np.array([errors.dielectric, errors.metal, errors.metal])
+    return np.hypot(np.minimum(np.nan_to_num(kinds.deviation), _LARGEST), measured)
 
 
 # ------------------------------------------------------------------------------------------------------------ intervals
@@ -196,6 +225,11 @@ class AlbedoIntervals:
         low, high = (mixture_quantile(p, weight, of_kinds, error, freedom) for p in (_OUTSIDE, 1.0 - _OUTSIDE))
         return cls(middle, *_half_widths(middle, low, high, known[:, None]), relative, additive)
 
+    @property
+    def until(self) -> NDArray:
+        """(O, 3) factors from which on nothing is claimed: 0 where the albedo is not known, infinite elsewhere."""
+        return np.where(np.isfinite(self.above), np.inf, 0.0)
+
     def scale(self, albedo: ArrayLike) -> NDArray:
         """Return albedos (O, 3) on the scale on which each has the error 1: asinh(s a / delta) / s (Eq. M.58)."""
         return np.arcsinh(self.relative * np.asarray(albedo, np.float64) / self.additive) / self.relative
@@ -227,7 +261,7 @@ class RoughnessIntervals:
     above: NDArray
 
     @classmethod
-    def of(cls, roughness: ArrayLike, kinds: Kinds) -> RoughnessIntervals:
+    def of(cls, roughness: ArrayLike, kinds: Kinds, errors: MeasuredErrors) -> RoughnessIntervals:
         """Combine the errors of the mean roughness (O,) of objects with what the fit left open."""
         r = np.asarray(roughness, np.float64)
         known = np.isfinite(r) & (kinds.seen >= LEAST_SEEN)
@@ -235,10 +269,15 @@ class RoughnessIntervals:
         weight, of_kind = _mixture(kinds, kinds.roughness)
         chosen = weight.argmax(1)[:, None] == np.arange(weight.shape[1])
         of_kind = np.where(chosen, middle[:, None], np.clip(of_kind, 0.0, 1.0))
-        error = np.hypot(np.minimum(np.nan_to_num(kinds.deviation), _LARGEST), _PROFILE_ERROR)
+        error = roughness_error(kinds, errors)
         freedom = np.full_like(error, _DEGREES_OF_FREEDOM)
         low, high = (mixture_quantile(p, weight, of_kind, error, freedom) for p in (_OUTSIDE, 1.0 - _OUTSIDE))
         return cls(middle, *_half_widths(middle, low, high, known))
+
+    @property
+    def until(self) -> NDArray:
+        """(O,) factors from which on the interval is 0 to 1; 0 where nothing is claimed with any."""
+        return np.maximum(self.middle / self.below, (1.0 - self.middle) / self.above)
 
     def ends(self, factor: float) -> tuple[NDArray, NDArray]:
         """Return the lower and upper ends (O,) in [0, 1], half widths times `factor` > 0."""

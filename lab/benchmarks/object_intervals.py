@@ -32,11 +32,13 @@ from scipy.special import stdtrit
 import lab  # noqa: F401  for the sources of the laboratory
 from iif_core.errors import InputError
 from iif_core.fitting.intervals import (
+    LEAST_SEEN,
     AlbedoIntervals,
     MeasuredErrors,
     MetallicIntervals,
     RoughnessIntervals,
     conformal_factor,
+    roughness_error,
     student_width,
 )
 from iif_core.fitting.problem import Kinds
@@ -56,14 +58,13 @@ KEPT_BACK = ("tiny", "tiny-gloss", "gloss")
 """Rooms that set no constant, because the gates of `make test` are on them (tests/lab/gates.py)."""
 DARK, FEW = 0.1, 500
 """Objects of a lower albedo or of fewer pixels do not tell the error of hue: the additive error and borders hide it there."""
-HELD = {
-    "albedo": ("albedo", "albedo_width"),
-    "roughness": ("roughness_of_claimed", "roughness_width_of_claimed"),
-    "metallic": ("metallic", "metallic_width"),
-}
-"""What the product says of each quantity: of roughness, about the objects whose interval is narrower than 0 to 1."""
+HELD = ("albedo", "roughness", "metallic")
+"""What the product says something of: of roughness, about the objects whose interval is narrower than 0 to 1."""
 SIZES = np.log([[1e-4, 0.3], [1e-3, 30.0]])
 """Logarithms of the limits of the additive error and of that of borders."""
+ROUGHNESS = np.log([[1e-3, 1.0], [1e-3, 1.0]])
+"""The same of the errors of roughness of non-metals and metals."""
+NO_ERRORS = MeasuredErrors(*[1e-6] * 5, 1.0, 1.0, 1.0)
 SIGMA = 0.6827
 """Share of a normal distribution within one standard deviation."""
 Array = np.ndarray
@@ -91,8 +92,8 @@ class Room:
     def albedo(self, errors: MeasuredErrors) -> AlbedoIntervals:
         return AlbedoIntervals.of(self.estimate[:, :3], self.level, self.pixels, self.room_error, self.kinds, errors)
 
-    def roughness(self) -> RoughnessIntervals:
-        return RoughnessIntervals.of(self.estimate[:, 3], self.kinds)
+    def roughness(self, errors: MeasuredErrors) -> RoughnessIntervals:
+        return RoughnessIntervals.of(self.estimate[:, 3], self.kinds, errors)
 
     def metallic(self) -> MetallicIntervals:
         return MetallicIntervals.of(self.estimate[:, 4], self.kinds)
@@ -191,27 +192,35 @@ def rooms_of(table: Sequence[Mapping[str, str]]) -> list[Room]:
 
 
 def fitted(rooms: Sequence[Room]) -> MeasuredErrors:
-    """Measure the error of hue, the most likely additive error and error of borders, and the factors. Every room weighs the same.
+    """Measure the error of hue, the most likely other errors, and the factors. Every room weighs the same.
 
     Raises:
         InputError: there are too few objects for a factor.
     """
     hue = _middle(*_weighted([_away_in_hue(room) for room in rooms]), SIGMA)
-
-    def unlikely(logs: Array) -> float:
-        return -sum(_log_likelihood(room, hue, *np.exp(logs)) for room in rooms)
-
-    additive, border = np.exp(minimize(unlikely, np.log([0.005, 0.4]), method="Nelder-Mead", bounds=SIZES).x)
-    errors = MeasuredErrors(float(additive), float(border), hue, 1.0, 1.0, 1.0)
+    additive, border = _likeliest(rooms, lambda room, e: _likely_albedo(room, hue, *e), [0.005, 0.4], SIZES)
+    dielectric, metal = _likeliest(rooms, _likely_roughness, [0.1, 0.2], ROUGHNESS)
+    errors = MeasuredErrors(additive, border, hue, dielectric, metal, 1.0, 1.0, 1.0)
+    albedo, roughness = [room.albedo(errors) for room in rooms], [room.roughness(errors) for room in rooms]
     factors = {
-        "albedo": _factor(rooms, lambda room: (own := room.albedo(errors)).residual(room.truth[:, :3])[np.isfinite(own.above)]),
-        "roughness": _factor(rooms, lambda room: (own := room.roughness()).residual(room.truth[:, 3])[np.isfinite(own.above)]),
+        "albedo": _factor([(own.residual(room.truth[:, :3]), own.until) for room, own in zip(rooms, albedo, strict=True)]),
+        "roughness": _factor([(own.residual(room.truth[:, 3]), own.until) for room, own in zip(rooms, roughness, strict=True)]),
         # Below 1 the evidence for a kind would count for more than the fit itself takes it for.
-        "metallic": max(1.0, _factor(rooms, lambda room: room.metallic().residual(room.truth[:, 4]))),
+        "metallic": max(1.0, _factor([(room.metallic().residual(room.truth[:, 4]), np.inf) for room in rooms])),
     }
     if not np.isfinite(list(factors.values())).all():
         raise InputError(f"object_intervals: {factors} from {len(rooms)} rooms; measure more rooms (--make)")
     return replace(errors, **factors)
+
+
+def _likeliest(
+    rooms: Sequence[Room], likely: Callable[[Room, Array], float], start: Sequence[float], limits: Array
+) -> list[float]:
+    """Return the errors that maximise the sum of a log likelihood over rooms."""
+    found = minimize(
+        lambda x: -sum(likely(room, np.exp(x)) for room in rooms), np.log(start), method="Nelder-Mead", bounds=limits
+    )
+    return [float(value) for value in np.exp(found.x)]
 
 
 def _away_in_hue(room: Room) -> Array:
@@ -221,7 +230,7 @@ def _away_in_hue(room: Room) -> Array:
     return np.abs(ratio - brightness[:, None]).ravel()
 
 
-def _log_likelihood(room: Room, hue: float, additive: float, border: float) -> float:
+def _likely_albedo(room: Room, hue: float, additive: float, border: float) -> float:
     """Mean log density of the true albedos: Student's t on the scale of Eq. M.58, times its slope 1 / sqrt((s a)^2 + delta^2)."""
     known = room.level > 0
     estimate, truth = room.estimate[known, :3], room.truth[known, :3]
@@ -232,8 +241,23 @@ def _log_likelihood(room: Room, hue: float, additive: float, border: float) -> f
     return float((-2.5 * np.log1p(z**2 / 4.0) - np.log(np.hypot(relative * truth, additive))).mean())
 
 
-def _factor(rooms: Sequence[Room], residual: Callable[[Room], Array]) -> float:
-    return conformal_factor(*_weighted([np.ravel(residual(room)) for room in rooms]))
+def _likely_roughness(room: Room, errors: Array) -> float:
+    """Mean log density of the true roughness of objects whose roughness photographs tell: Student's t of the chosen kinds."""
+    told = room.kinds.seen >= LEAST_SEEN
+    if not told.any():
+        return 0.0
+    chosen = room.kinds.probability.argmax(1)
+    error = roughness_error(room.kinds, replace(NO_ERRORS, dielectric=errors[0], metal=errors[1]))
+    error = error[np.arange(len(chosen)), chosen][told]
+    z = (room.estimate[:, 3] - room.truth[:, 3])[told] / error * stdtrit(4.0, 0.5 + 0.5 * SIGMA)
+    return float((-2.5 * np.log1p(z**2 / 4.0) - np.log(error)).mean())
+
+
+def _factor(claims: Sequence[tuple[Array, Array | float]]) -> float:
+    """Return the factor of rooms, from the factors with which claims just hold the truth, and until which they are claims."""
+    flat = [[column.ravel() for column in np.broadcast_arrays(*own)] for own in claims]
+    residual, until = (np.concatenate(column) for column in zip(*flat, strict=True))
+    return conformal_factor(residual, np.repeat(np.arange(len(flat)), [len(own[0]) for own in flat]), until)
 
 
 def _weighted(found: Sequence[Array]) -> tuple[Array, Array]:
@@ -254,12 +278,14 @@ def coverage(room: Room, errors: MeasuredErrors) -> dict[str, float]:
         "relative_width": _middle(0.5 * (high - low).mean(1) / np.maximum(middle, 1e-3), room.cells),
         "level": float(abs(room.level_error) <= student_width(np.inf) * room.room_error),
     }
-    for name, own, column in (("roughness", room.roughness(), 3), ("metallic", room.metallic(), 4)):
-        low, high = own.ends(getattr(errors, name))
-        inside, claimed = (low <= truth[:, column]) & (truth[:, column] <= high), high - low < 0.999
-        out |= {name: float(inside.mean()), f"{name}_width": float(np.median(0.5 * (high - low)))}
-        out |= {f"{name}_claimed": float(claimed.mean()), f"{name}_of_claimed": _mean(inside[claimed])}
-        out |= {f"{name}_width_of_claimed": float(np.median(0.5 * (high - low)[claimed])) if claimed.any() else np.nan}
+    of_roughness, factor = room.roughness(errors), errors.roughness
+    low, high = of_roughness.ends(factor)
+    inside, claimed, half = (low <= truth[:, 3]) & (truth[:, 3] <= high), of_roughness.until > factor, 0.5 * (high - low)
+    out |= {"roughness": _mean(inside[claimed]), "roughness_claimed": float(claimed.mean())}
+    out |= {"roughness_width": float(np.median(half[claimed])) if claimed.any() else np.nan}
+    low, high = room.metallic().ends(errors.metallic)
+    inside = (low <= truth[:, 4]) & (truth[:, 4] <= high)
+    out |= {"metallic": float(inside.mean()), "metallic_width": float(np.median(0.5 * (high - low)))}
     metal = truth[:, 4] > 0.5
     out["metals"] = float(metal.sum())
     out["metals_held"] = _mean(inside[metal])
@@ -317,10 +343,10 @@ def _summary(found: Sequence[Mapping[str, float]]) -> list[str]:
 def document(told: Sequence[Room], found: Sequence[Mapping[str, float]], errors: MeasuredErrors) -> dict[str, Any]:
     """Return what the product reads: `errors` of the rooms that were `told`, and what was `found` in rooms as captured."""
     held = {}
-    for name, (share, width) in HELD.items():
-        shares = [row[share] for row in found if np.isfinite(row[share])]
+    for name in HELD:
+        shares = [row[name] for row in found if np.isfinite(row[name])]
         held[name] = {"pooled": float(np.mean(shares)), "lowest": min(shares), "highest": max(shares)}
-        held[name]["half_width"] = float(np.nanmean([row[width] for row in found]))
+        held[name]["half_width"] = float(np.nanmean([row[f"{name}_width"] for row in found]))
     numbers = {name: float(f"{value:.4g}") for name, value in vars(errors).items()}
     held = {name: {key: round(value, 4) for key, value in entry.items()} for name, entry in held.items()}
     metals, inside = _metals(found)
@@ -339,7 +365,7 @@ def _metals(found: Sequence[Mapping[str, float]]) -> tuple[int, int]:
     return round(sum(row["metals"] for row in found)), round(held)
 
 
-SHARES = ("albedo", "brightness", "roughness_of_claimed", "metallic")
+SHARES = ("albedo", "brightness", "roughness", "metallic")
 
 
 def of_rooms(pairs: Sequence[tuple[Room, Mapping[str, float]]]) -> list[str]:
@@ -401,8 +427,7 @@ def _level(rooms: Sequence[Room]) -> str:
 
 
 def _widths(row: Mapping[str, float]) -> list[str]:
-    claimed = row["roughness_width_of_claimed"]
-    narrow = f"{claimed:.2f}" if np.isfinite(claimed) else "-"
+    narrow = f"{width:.2f}" if np.isfinite(width := row["roughness_width"]) else "-"
     return [f"{row['albedo_width']:.3f}", _percent(row["relative_width"]), narrow, _percent(row["roughness_claimed"])]
 
 

@@ -16,7 +16,7 @@ from lab.benchmarks import object_intervals as measurement
 from tests.lab import gates
 from workflow.decisions.held import FILE
 
-TRUE = MeasuredErrors(additive=0.01, border=0.4, hue=0.05, albedo=1.0, roughness=1.0, metallic=1.0)
+TRUE = MeasuredErrors(0.01, 0.4, 0.05, dielectric=0.1, metal=0.25, albedo=1.0, roughness=1.0, metallic=1.0)
 
 
 def room(seed: int, scale: float = 1.0, objects: int = 200) -> measurement.Room:
@@ -27,10 +27,13 @@ def room(seed: int, scale: float = 1.0, objects: int = 200) -> measurement.Room:
     of_level = level / stats.t.ppf(stats.norm.cdf(1), 4) * rng.standard_t(4, objects)
     hue, additive = TRUE.hue * rng.normal(size=(objects, 3)), np.hypot(TRUE.additive, TRUE.border / np.sqrt(pixels))
     albedo = truth[:, :3] * np.exp(scale * (of_level[:, None] + hue)) + scale * additive[:, None] * rng.normal(size=(objects, 3))
-    roughness = np.clip(truth[:, 3] + 0.08 * scale * rng.normal(size=objects), 0.02, 1)
+    metal = rng.random(objects) < 0.3
+    error = np.hypot(0.04, np.where(metal, TRUE.metal, TRUE.dielectric)) / stats.t.ppf(stats.norm.cdf(1), 4)
+    roughness = truth[:, 3] + scale * error * rng.standard_t(4, objects)
     none = np.zeros((objects, 3))
-    kinds = Kinds(none + [1.0, 0.0, 0.0], none, none + 0.5, none + 0.08, np.ones(objects))
-    estimate = np.c_[np.clip(albedo, 0, 1), roughness, np.zeros(objects)]
+    kinds = Kinds(np.c_[~metal, metal, none[:, 0]].astype(float), none, none + 0.5, none + 0.04, np.ones(objects))
+    estimate = np.c_[np.clip(albedo, 0, 1), roughness, metal]
+    truth[:, 4] = metal
     return measurement.Room(f"r{seed}", estimate, truth, level, 1e-3, np.full(objects, 100.0), pixels, kinds)
 
 
@@ -38,6 +41,7 @@ def test_errors_of_the_model_are_found_again():
     found = measurement.fitted([room(seed) for seed in range(8)])
     assert found.hue == pytest.approx(TRUE.hue, rel=0.25)
     assert found.additive == pytest.approx(TRUE.additive, rel=0.35) and found.border == pytest.approx(TRUE.border, rel=0.35)
+    assert found.dielectric == pytest.approx(TRUE.dielectric, rel=0.25) and found.metal == pytest.approx(TRUE.metal, rel=0.25)
     assert found.albedo == pytest.approx(1.0, abs=0.2) and found.metallic == 1.0
 
 

@@ -169,7 +169,7 @@ def test_objects_are_means_with_intervals():
     for c, name in enumerate("rgb"):
         assert table[f"base_colour_{name}_low"][0] == pytest.approx(low[0, c], rel=1e-4), name
         assert table[f"base_colour_{name}_high"][0] == pytest.approx(high[0, c], rel=1e-4), name
-    low, high = RoughnessIntervals.of([0.6], kinds).ends(errors.roughness)
+    low, high = RoughnessIntervals.of([0.6], kinds, errors).ends(errors.roughness)
     assert (table["roughness_low"][0], table["roughness_high"][0]) == pytest.approx((low[0], high[0]), rel=1e-4)
     assert (table["metallic_low"][0], table["metallic_high"][0]) == (0.0, 0.0)  # surely a dielectric
     assert (table["roughness_low"][1], table["roughness_high"][1]) == (0.1, 0.1)  # given by hand

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -21,7 +23,8 @@ from iif_core.fitting.intervals import (
 )
 from iif_core.fitting.problem import Kinds
 
-NOTHING = MeasuredErrors(1e-6, 1e-6, 1e-6, 1.0, 1.0, 1.0)
+NOTHING = MeasuredErrors(*[1e-6] * 5, 1.0, 1.0, 1.0)
+USUAL = MeasuredErrors(0.01, 0.4, 0.05, 0.1, 0.2, 1.0, 1.0, 1.0)
 Q4 = stats.t.ppf(0.975, 4) / stats.t.ppf(stats.norm.cdf(1), 4)
 
 
@@ -75,31 +78,59 @@ def test_quantile_of_one_part_is_that_of_student():
     assert found == pytest.approx(1.0 + 0.5 * Q4)
 
 
-@given(st.lists(st.floats(0, 100), min_size=1, max_size=80), st.sampled_from([0.5, 0.8, 0.95]), st.floats(0.1, 10.0))
-def test_conformal_factor_is_the_order_statistic_of_its_definition(residual, probability, weight):
+def one_room(residual, *, probability=0.95, until=np.inf):
+    return conformal_factor(residual, np.zeros(len(residual), int), until, probability)
+
+
+@given(st.lists(st.floats(0, 100), min_size=1, max_size=80), st.sampled_from([0.5, 0.8, 0.95]))
+def test_conformal_factor_is_the_order_statistic_of_its_definition(residual, probability):
     """The smallest q with #{r <= q} >= p (n + 1)."""
     n, ordered = len(residual), sorted(residual)
     needed = int(np.ceil(round(probability * (n + 1), 9)))
     expected = ordered[needed - 1] if needed <= n else np.inf
-    assert conformal_factor(residual, np.full(n, weight), probability) == expected
+    assert one_room(residual, probability=probability) == expected
 
 
 def test_nineteen_errors_are_the_fewest_for_95_percent():
-    assert conformal_factor(np.arange(19.0), np.ones(19)) == 18.0
-    assert conformal_factor(np.arange(18.0), np.ones(18)) == np.inf == conformal_factor([], [])
+    assert one_room(np.arange(19.0)) == 18.0
+    assert one_room(np.arange(18.0)) == np.inf == one_room([])
 
 
 def test_conformal_factor_holds_the_next_error_as_often_as_asked():
     rng = np.random.default_rng(1)
     draws = rng.exponential(size=(4000, 40))
-    inside = [row[-1] <= conformal_factor(row[:-1], np.ones(39), 0.9) for row in draws]
+    inside = [row[-1] <= one_room(row[:-1], probability=0.9) for row in draws]
     assert np.mean(inside) == pytest.approx(0.9, abs=4 * np.sqrt(0.09 / 4000))
 
 
 def test_every_room_weighs_the_same_in_the_factor():
     """A room of many small errors does not outvote one of few large ones."""
-    residual, weight = np.r_[np.zeros(1000), 5.0, 5.0], np.r_[np.full(1000, 1e-3), 0.5, 0.5]
-    assert conformal_factor(residual, weight, 0.4) == 0.0 and conformal_factor(residual, weight, 0.6) == 5.0
+    residual, room = np.r_[np.zeros(1000), 5.0, 5.0], np.r_[np.zeros(1000, int), 1, 1]
+    found = [conformal_factor(residual, room, probability=share) for share in (0.4, 0.6)]
+    assert found == [0.0, 5.0]
+
+
+CLAIM = st.tuples(st.floats(0, 10), st.sampled_from([0.0, 1.0, 3.0, 5.0, 20.0, np.inf]), st.integers(0, 3))
+
+
+@given(st.lists(CLAIM, max_size=60), st.sampled_from([0.5, 0.8, 0.95]))
+def test_conformal_factor_counts_what_is_still_claimed(claims, probability):
+    """By brute force: the least factor with which the means over rooms of what is claimed are held often enough."""
+    residual, until, room = (np.array(column) for column in zip(*claims, strict=True)) if claims else np.zeros((3, 0))
+    expected = np.inf
+    for factor in sorted({*residual, *until}):
+        shares = [(residual <= factor)[own].mean() for r in range(4) if (own := (room == r) & (until > factor)).any()]
+        n = (until > factor).sum()
+        if np.isfinite(factor) and shares and sum(shares) >= probability * len(shares) * (1 + 1 / n) * (1 - 1e-12):
+            expected = factor
+            break
+    assert conformal_factor(residual, room, until, probability) == expected
+
+
+def test_a_claim_that_has_grown_to_everything_holds_nothing():
+    """Twenty narrow claims hold; nineteen that do not are 0 to 1 from 2 on, and are no claims any more with 2."""
+    residual, until = np.r_[np.full(20, 1.0), np.full(19, 9.0)], np.r_[np.full(20, 30.0), np.full(19, 2.0)]
+    assert one_room(residual, until=until) == 2.0 and one_room(residual) == 9.0
 
 
 # -------------------------------------------------------------------------------------------------------------- albedo
@@ -110,10 +141,10 @@ def test_bright_albedo_has_a_factor_and_dark_albedo_an_offset():
     assert low[0] == pytest.approx(0.3 * np.exp(-0.1 * Q4), rel=1e-4) and high[0] == pytest.approx(
         0.3 * np.exp(0.1 * Q4), rel=1e-4
     )
-    additive = MeasuredErrors(0.02, 1e-6, 1e-6, 1.0, 1.0, 1.0)
+    additive = replace(NOTHING, additive=0.02)
     low, high = albedo(0.0, errors=additive)  # the additive error alone, which is normal
     assert low[0] == 0.0 and high[0] == pytest.approx(0.02 * 1.959964, rel=0.01)
-    borders = MeasuredErrors(0.012, 0.32, 1e-6, 1.0, 1.0, 1.0)  # 0.32 / sqrt(400) = 0.016, and 0.02 with the additive error
+    borders = replace(NOTHING, additive=0.012, border=0.32)  # 0.32 / sqrt(400) = 0.016, and 0.02 with the additive error
     assert albedo(0.0, pixels=400, errors=borders)[1][0] == pytest.approx(high[0], rel=1e-6)
     low, high = albedo(0.5, level=1e-9, errors=additive)
     assert (low[0], high[0]) == pytest.approx((0.5 - 0.02 * 1.959964, 0.5 + 0.02 * 1.959964), rel=1e-4)
@@ -121,7 +152,7 @@ def test_bright_albedo_has_a_factor_and_dark_albedo_an_offset():
 
 def test_relative_errors_add_up_in_squares():
     """Level of the object 0.03, room 0.1, hue 0.05."""
-    low, high = albedo(0.3, level=0.03, room=0.1, errors=MeasuredErrors(1e-6, 1e-6, 0.05, 1.0, 1.0, 1.0))
+    low, high = albedo(0.3, level=0.03, room=0.1, errors=replace(NOTHING, hue=0.05))
     total, freedom = pooled(np.array([0.03, 0.1, 0.05]) ** 2, [4.0, np.inf, np.inf])
     expected = np.sqrt(total) * student_width(freedom)
     assert np.log(high[0] / 0.3) == pytest.approx(expected, rel=1e-3) == np.log(0.3 / low[0])
@@ -129,7 +160,7 @@ def test_relative_errors_add_up_in_squares():
 
 def test_freedom_is_that_of_the_errors_at_the_albedo():
     """In the dark the additive error, which is normal, prevails over that of the level, which has four degrees of freedom."""
-    errors = MeasuredErrors(0.02, 1e-6, 1e-6, 1.0, 1.0, 1.0)
+    errors = replace(NOTHING, additive=0.02)
     for value in (0.02, 0.1, 0.5):
         own = AlbedoIntervals.of([[value] * 3], [0.1], [1e12], 0.0, kinds(), errors)
         freedom = pooled([(0.1 * value) ** 2, 0.02**2], [4.0, np.inf])[1]
@@ -162,7 +193,7 @@ def test_what_is_not_known_lies_within_0_and_1(level, room, value):
 
 def test_stated_errors_of_the_model_are_held_as_often_as_claimed():
     rng = np.random.default_rng(2)
-    n, errors = 20_000, MeasuredErrors(0.01, 0.4, 0.05, 1.0, 1.0, 1.0)
+    n, errors = 20_000, USUAL
     truth, level, pixels = rng.uniform(0.02, 0.6, (n, 3)), rng.uniform(0.05, 0.1, n), rng.uniform(100, 1000, n)
     scale = 1.0 / stats.t.ppf(stats.norm.cdf(1), 4)
     relative = level * scale * rng.standard_t(4, n) + 0.1 * rng.normal(size=n)
@@ -175,23 +206,39 @@ def test_stated_errors_of_the_model_are_held_as_often_as_claimed():
 # ------------------------------------------------------------------------------------------------- roughness, metallic
 
 
-def test_roughness_has_the_errors_of_profile_and_grid():
-    low, high = RoughnessIntervals.of([0.4, 0.9], kinds(2, deviation=0.12)).ends(0.8)
+def test_roughness_has_the_errors_of_its_profile_and_of_its_kind():
+    errors = replace(NOTHING, dielectric=0.05, metal=0.3)
+    low, high = RoughnessIntervals.of([0.4, 0.9], kinds(2, deviation=0.12), errors).ends(0.8)
     half = 0.8 * Q4 * np.hypot(0.12, 0.05)
     assert low == pytest.approx([0.4 - half, 0.9 - half]) and high == pytest.approx([0.4 + half, 1.0])
-    both = RoughnessIntervals.of([0.4], kinds(probability=(0.7, 0.3, 0.0), roughness=(0.4, 0.8, 0.0), deviation=0.12)).ends(1.0)
+    metal = RoughnessIntervals.of([0.4], kinds(probability=(0.0, 1.0, 0.0), deviation=0.12), errors)
+    assert metal.above[0] == pytest.approx(Q4 * np.hypot(0.12, 0.3)) == metal.below[0]
+    of = kinds(probability=(0.7, 0.3, 0.0), roughness=(0.4, 0.8, 0.0), deviation=0.12)
+    (low,), (high,) = RoughnessIntervals.of([0.4], of, errors).ends(0.5)
     rng = np.random.default_rng(3)
-    draws = np.where(rng.random(400_000) < 0.3, 0.8, 0.4) + np.hypot(0.12, 0.05) / 1.1416 * rng.standard_t(4, 400_000)
-    assert (both[0][0], both[1][0]) == pytest.approx(
-        (max(np.quantile(draws, 0.025), 0), min(np.quantile(draws, 0.975), 1)), abs=0.01
-    )
+    is_metal = rng.random(400_000) < 0.3
+    error = np.hypot(0.12, np.where(is_metal, 0.3, 0.05)) / 1.1416
+    ends = np.quantile(np.where(is_metal, 0.8, 0.4) + error * rng.standard_t(4, 400_000), [0.025, 0.975])
+    assert [low, high] == pytest.approx(np.clip(0.4 + 0.5 * (ends - 0.4), 0, 1), abs=0.01)
 
 
 def test_roughness_that_no_photograph_shows_is_0_to_1():
-    low, high = RoughnessIntervals.of([0.4, 0.4, np.nan], kinds(3, seen=0.49)).ends(1.0)
-    assert (low == 0).all() and (high == 1).all()
-    seen = RoughnessIntervals.of([0.4], kinds(seen=0.51)).ends(1.0)
+    own = RoughnessIntervals.of([0.4, 0.4, np.nan], kinds(3, seen=0.49), USUAL)
+    low, high = own.ends(1.0)
+    assert (low == 0).all() and (high == 1).all() and (own.until == 0).all()
+    seen = RoughnessIntervals.of([0.4], kinds(seen=0.51), USUAL).ends(0.5)
     assert seen[0][0] > 0.01 and seen[1][0] < 0.99
+
+
+@settings(deadline=None)
+@given(st.floats(0, 1), st.floats(0.001, 1.0))
+def test_roughness_is_claimed_until_its_interval_is_0_to_1(value, deviation):
+    own = RoughnessIntervals.of([value], kinds(deviation=deviation), USUAL)
+    until = own.until[0]
+    (low,), (high,) = own.ends(until * (1 + 1e-9))
+    assert low == pytest.approx(0, abs=1e-12) and high == pytest.approx(1, abs=1e-12)
+    (low,), (high,) = own.ends(until * (1 - 1e-6))
+    assert low > 0 or high < 1
 
 
 def test_metallic_excludes_what_is_rarer_than_one_in_twenty():
@@ -216,11 +263,10 @@ PROBABILITIES = st.tuples(ANY, ANY, ANY).map(lambda p: p if np.isfinite(p).all()
 @given(ANY, ANY, ANY, ANY, PROBABILITIES, st.floats(-50, 50), ANY, st.sampled_from([1e-3, 1.0, 1e3]))
 def test_intervals_are_within_0_and_1_whatever_is_known(value, level, pixels, room, probability, shift, deviation, factor):
     of = kinds(probability=probability, brightness=(0.0, shift, -shift), roughness=(value, value, value), deviation=deviation)
-    errors = MeasuredErrors(0.01, 0.4, 0.05, 1.0, 1.0, 1.0)
     with np.errstate(all="raise", under="ignore"):
         made = [
-            AlbedoIntervals.of([[value] * 3], [level], [pixels], room, of, errors).ends(factor),
-            RoughnessIntervals.of([value], of).ends(factor),
+            AlbedoIntervals.of([[value] * 3], [level], [pixels], room, of, USUAL).ends(factor),
+            RoughnessIntervals.of([value], of, USUAL).ends(factor),
             MetallicIntervals.of([value], of).ends(factor),
         ]
     for low, high in made:
@@ -233,8 +279,7 @@ def test_an_interval_of_the_residual_just_reaches_the_truth(value, truth, level,
     of = kinds(
         probability=(1 - other, other, 0.0), brightness=(0.0, shift, 0.0), roughness=(value, 0.5, 0.5), deviation=level / 3
     )
-    errors = MeasuredErrors(0.01, 0.4, 0.05, 1.0, 1.0, 1.0)
-    for own in (AlbedoIntervals.of([[value] * 3], [level], [100], 0.1, of, errors), RoughnessIntervals.of([value], of)):
+    for own in (AlbedoIntervals.of([[value] * 3], [level], [100], 0.1, of, USUAL), RoughnessIntervals.of([value], of, USUAL)):
         factor = float(np.max(own.residual([truth])))
         low, high = (float(np.ravel(end)[0]) for end in own.ends(max(factor, 1e-12)))
         assert (high if truth > value else low) == pytest.approx(truth, abs=1e-6)
@@ -244,7 +289,8 @@ def test_an_interval_of_the_residual_just_reaches_the_truth(value, truth, level,
     "spoilt", [{"hue": 0.0}, {"hue": None}, {"albedo": float("nan")}, {"border": float("inf")}, {"metallic": "1"}]
 )
 def test_spoilt_constants_are_refused(spoilt):
-    whole = {"additive": 0.01, "hue": 0.05, "border": 1.0, "albedo": 1.2, "roughness": 1.0, "metallic": 1.0}
+    whole = {"additive": 0.01, "hue": 0.05, "border": 1.0, "dielectric": 0.1, "metal": 0.2}
+    whole |= {"albedo": 1.2, "roughness": 1.0, "metallic": 1.0}
     assert MeasuredErrors.from_facts(whole, "f").albedo == 1.2
     with pytest.raises(InputError):
         MeasuredErrors.from_facts(whole | spoilt, "f")

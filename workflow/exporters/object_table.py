@@ -48,7 +48,7 @@ def object_rows(
     level, pixels = _by_id(fit, "std_level", n), _by_id(fit, "pixels", n)
     low, high = AlbedoIntervals.of(mean[:, :3], level, pixels, room_error, kinds, errors).ends(errors.albedo)
     of_others = {
-        "roughness": RoughnessIntervals.of(mean[:, 3], kinds).ends(errors.roughness),
+        "roughness": RoughnessIntervals.of(mean[:, 3], kinds, errors).ends(errors.roughness),
         "metallic": MetallicIntervals.of(mean[:, 4], kinds).ends(errors.metallic),
     }
     given = dict(zip(np.asarray(fit["object_id"]).tolist(), fit["given"], strict=True)) if "given" in fit else {}
