@@ -1,7 +1,8 @@
 """Registration of photographs with a mesh: small corrections of poses and common intrinsics, and the sharpness of each view.
 
 The photographs have to agree with each other on surface points, and with the edges of the mesh (Eq. C.30). The texture values of
-the points are eliminated; steps are Gauss-Newton with Cauchy's weights, on images that are blurred less and less.
+the points are eliminated; steps are Gauss-Newton with Cauchy's weights, on images blurred less and less. First comes what all
+cameras share, then each camera for itself; what held-out surface does not confirm is undone.
 """
 
 from __future__ import annotations
@@ -15,14 +16,18 @@ from iif_core.camera.exposure import estimate_gains
 from iif_core.errors import InputError
 
 SIGMA_ROTATION, SIGMA_TRANSLATION = 0.02, 0.03
-"""Standard deviation of the correction of a view: radians, metres."""
+"""Standard deviation of the correction that all views share, and of that of a view beside it: radians, metres."""
 SIGMA_PRINCIPAL, SIGMA_FOCAL = 0.02, 0.02
 """Standard deviation of the common corrections, relative to the focal length."""
 DARK = 0.06
 """Luminance relative to the median below which texture counts as noise; an 8-bit photograph has some five levels there."""
 BLURS = (2.5, 1.2, 0.7)
 """Standard deviations of the successive blurs of the feature images, in pixels."""
+SURE = 3.0
+"""Standard errors, of both measures together, by which held-out surface must be better, and by which neither may be worse."""
 STEPS_PER_BLUR = 6
+SHARED_EVERY = 4
+"""What all cameras share, nine numbers, is found from one in so many points."""
 MIN_COSINE = 0.25
 """Smallest cosine between normal and viewing direction at which surface is compared."""
 HELD_OUT_BLOCK = 0.3
@@ -70,7 +75,9 @@ class Registration:
         edges: (before, after) mean photograph edge at held-out edges of the mesh.
         edge_gain, edge_error: its increase and the standard error over views.
         rows: (point, view) pairs compared.
-        accepted: whether the correction satisfies Eq. C.32 and there are at least MIN_VIEWS views that are not held.
+        accepted: whether a correction satisfies Eq. C.32 and there are at least MIN_VIEWS views that are not held; without it the
+            other numbers are of the whole correction, which does not.
+        each: whether the views are corrected each for itself, and not only all alike.
         sharpness: (V,) gradient of the texture relative to the other views; 1 = typical, 0 = not compared, as all that are held.
         agreement: (V,) correlation of features with the mean of the other views, after registration; 0 = not compared.
         shift: (V,) remaining translation against the texture of the other views, in pixels (Eq. C.33).
@@ -90,9 +97,15 @@ class Registration:
     edge_error: float
     rows: int
     accepted: bool
+    each: bool
     sharpness: np.ndarray
     agreement: np.ndarray
     shift: np.ndarray
+
+    @property
+    def evidence(self) -> float:
+        """What held-out surface says for the correction, in standard errors."""
+        return combined([(self.gain, self.error), (self.edge_gain, self.edge_error)])
 
 
 def feature_image(image: np.ndarray, usable: np.ndarray) -> np.ndarray:
@@ -171,51 +184,79 @@ def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = T
 
     # -------- features, shared surface points, edges of the mesh --------
     # Blocks of surface are held out from both kinds of rows, for the decision at the end.
-    start = state = _Cameras.of(photos)
+    start = _Cameras.of(photos)
     features = [feature_image(p.image, p.usable) for p in photos]
     rows = _overlap(photos, features, points)
     edges = [_edge_points(p) for p in photos]
     held = [_held_out(world) for world in edges]
     fit = rows.take(~rows.held_out)
     seen = [world[~h] for world, h in zip(edges, held, strict=True)]
-    # Unknowns: a twist of each view, then principal point and log focal length.
-    free = np.r_[np.repeat(poses, 6 * len(photos)), np.repeat(intrinsics, 3)].astype(bool)
 
-    # -------- Gauss-Newton, from blurred to sharp --------
-    # A linear model of an image holds within its blur: wide blurs bring cameras close, narrow ones make them precise.
-    for blur in BLURS if free.any() else ():
-        maps = [_Maps.of(f, blur) for f in features]
-        for _ in range(STEPS_PER_BLUR):
-            step = _step(photos, maps, state, fit, seen, free)
-            state = state.moved(step)
-
-    # -------- decision on held-out surface (Eq. C.32) --------
-    maps = [_Maps.of(f, BLURS[-1]) for f in features]
-    # Held photographs have no say: what is compared from here on is of the others.
+    # -------- judges: held-out surface, in what photographs show that are not held --------
     moving = np.array([not p.held for p in photos])
     rows = rows.take(moving[rows.view])
-    unseen = [world[h & own] for world, h, own in zip(edges, held, moving, strict=True)]
-    spread, gain, error = _compare_features(photos, maps, (start, state), rows.take(rows.held_out))
-    tied, edge_gain, edge_error = _compare_edges(photos, maps, (start, state), unseen)
-    better = gain > 2.0 * error or (edge_gain > 2.0 * edge_error and gain > 0.0)
-    worse = gain < -2.0 * error or edge_gain < -2.0 * edge_error
-    accepted = bool(better and not worse and moving.sum() >= MIN_VIEWS)
-    final = state if accepted else start
+    judged = rows.take(rows.held_out), [world[h & own] for world, h, own in zip(edges, held, moving, strict=True)]
+    maps = [_Maps.of(f, BLURS[-1]) for f in features]
+
+    # -------- Gauss-Newton: what all cameras share, then each camera from where it is, and from further away --------
+    few = fit.take(fit.point % SHARED_EVERY == 0), [world[::SHARED_EVERY] for world in seen]
+    alike, each = _shared(len(photos), poses, intrinsics), _each(len(photos), poses, intrinsics)
+    final, own = start, False
+    for blurs, data, directions in ((BLURS, few, alike), (BLURS[1:], (fit, seen), each), (BLURS, (fit, seen), each)):
+        state = _descend(photos, features, blurs, final, *data, directions)
+        if moving.sum() >= MIN_VIEWS and _compare(photos, maps, (final, state), *judged).pays:
+            final, own = state, directions is each
+    state = state if final is start else final
+    found = _compare(photos, maps, (start, state), *judged)
     return Registration(
         state.pose,
         state.principal,
         state.focal,
         np.array([_motion(photos, start, state, v) for v in range(len(photos))]),
-        spread,
-        gain,
-        error,
-        tied,
-        edge_gain,
-        edge_error,
+        found.spread,
+        found.gain,
+        found.error,
+        found.edges,
+        found.edge_gain,
+        found.edge_error,
         len(rows.view),
-        accepted,
+        final is not start,
+        own,
         *_quality(photos, maps, final, rows),
     )
+
+
+def _shared(views: int, poses: bool, intrinsics: bool) -> np.ndarray:
+    """Return the directions (6 V + 3, n) in which all cameras move alike: one twist in their own frames, and the intrinsics."""
+    unknowns = np.zeros((6 * views + 3, 9))
+    unknowns[: 6 * views, :6] = np.tile(np.eye(6), (views, 1))
+    unknowns[6 * views :, 6:] = np.eye(3)
+    return unknowns[:, np.r_[np.repeat(poses, 6), np.repeat(intrinsics, 3)].astype(bool)]
+
+
+def _each(views: int, poses: bool, intrinsics: bool) -> np.ndarray:
+    """Return the directions (6 V + 3, n) in which every camera moves for itself: a twist of each, and the common intrinsics."""
+    return np.eye(6 * views + 3)[:, np.r_[np.repeat(poses, 6 * views), np.repeat(intrinsics, 3)].astype(bool)]
+
+
+def _descend(
+    photos: Sequence[Photo],
+    features: Sequence[np.ndarray],
+    blurs: Sequence[float],
+    start: _Cameras,
+    rows: _Rows,
+    edges: Sequence[np.ndarray],
+    directions: np.ndarray,
+) -> _Cameras:
+    """Move cameras along directions (6 V + 3, n) by Gauss-Newton, from blurred to sharp images."""
+    # The prior pulls each view towards where this descent starts, and the intrinsics towards the given ones.
+    state = replace(start, twist=np.zeros_like(start.twist))
+    # A linear model of an image holds within its blur: wide blurs bring cameras close, narrow ones make them precise.
+    for blur in blurs if directions.shape[1] else ():
+        maps = [_Maps.of(f, blur) for f in features]
+        for _ in range(STEPS_PER_BLUR):
+            state = state.moved(_step(photos, maps, state, rows, edges, directions))
+    return state
 
 
 @dataclass(frozen=True)
@@ -438,24 +479,26 @@ def _step(
     state: _Cameras,
     rows: _Rows,
     edges: Sequence[np.ndarray],
-    free: np.ndarray,
+    directions: np.ndarray,
 ) -> np.ndarray:
     """Compute one Gauss-Newton step (6 V + 3,): twists, principal point, log focal length."""
-    views = len(photos)
-    normal, right = normal_equations(photos, maps, state, rows, edges)
-    unknowns = np.flatnonzero(free)
-    step = np.zeros(len(right))
-    if len(unknowns):
-        step[unknowns] = np.linalg.solve(normal[np.ix_(unknowns, unknowns)], right[unknowns])
+    normal, right = normal_equations(photos, maps, state, rows, edges, directions)
+    step = directions @ np.linalg.solve(normal, right)
     # rad, m, and units of the focal length. The step takes images for linear, which holds over short distances only.
-    limit = np.r_[np.tile(np.repeat([0.02, 0.03], 3), views), [0.02, 0.02, 0.02]]
+    limit = np.r_[np.tile(np.repeat([0.02, 0.03], 3), len(photos)), [0.02, 0.02, 0.02]]
     return np.clip(step, -limit, limit)
 
 
 def normal_equations(
-    photos: Sequence[Photo], maps: Sequence[_Maps], state: _Cameras, rows: _Rows, edges: Sequence[np.ndarray]
+    photos: Sequence[Photo],
+    maps: Sequence[_Maps],
+    state: _Cameras,
+    rows: _Rows,
+    edges: Sequence[np.ndarray],
+    directions: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the matrix (6 V + 3, 6 V + 3) and the right-hand side of a step, texture values eliminated and prior added."""
+    """Return the matrix (n, n) and the right-hand side of a step along directions (6 V + 3, n): texture values eliminated, prior
+    added."""
     from scipy.sparse import coo_matrix
 
     views = len(photos)
@@ -502,14 +545,21 @@ def normal_equations(
 
     # -------- edges and priors, second to fourth sum of Eq. C.30 --------
     _add_edges(photos, maps, state, edges, normal, right)
-    precision = np.r_[np.tile(np.repeat([SIGMA_ROTATION, SIGMA_TRANSLATION], 3), views), [SIGMA_PRINCIPAL] * 2, SIGMA_FOCAL] ** -2
-    own = moving.sum() / max(sum(not p.held for p in photos), 1)
-    precision *= max(own / 200.0, 1.0)  # the errors of neighbouring rows are correlated
-    # The prior pulls towards the given cameras, hence towards the negative sum of all steps so far.
-    sum_of_steps = np.r_[state.twist.ravel(), state.principal, np.log(state.focal)]
-    normal[np.diag_indices(size)] += precision
-    right -= precision * sum_of_steps
-    return normal, right
+    # What a held-out photograph shows moves its own camera, and no direction that others share.
+    own = np.repeat([not p.held for p in photos], 6)
+    shared = (directions[: 6 * views] != 0).sum(0) > 1
+    used = directions.copy()
+    used[: 6 * views, shared] *= own[:, None]
+    normal, right = used.T @ normal @ used, used.T @ right
+    sigma = np.r_[np.tile(np.repeat([SIGMA_ROTATION, SIGMA_TRANSLATION], 3), views), [SIGMA_PRINCIPAL] * 2, SIGMA_FOCAL]
+    # A direction is one unknown, whose standard deviation is that of each camera; the steps so far are its mean over cameras.
+    count = directions.sum(0)
+    sigma = (directions.T @ sigma) / count
+    so_far = (directions.T @ np.r_[state.twist.ravel(), state.principal, np.log(state.focal)]) / count
+    rows_of_view = moving.sum() / max(sum(not p.held for p in photos), 1)
+    precision = max(rows_of_view / 200.0, 1.0) / sigma**2  # the errors of neighbouring rows are correlated
+    # The prior pulls towards the start, hence towards the negative sum of all steps so far.
+    return normal + np.diag(precision), right - precision * so_far
 
 
 def _add_edges(
@@ -534,6 +584,50 @@ def _add_edges(
         normal[np.ix_(at, at)] += weight * whole.T @ whole
         # The residual is 1 - E; its derivative is minus the Jacobian of E, hence the sign.
         right[at] += weight * whole.T @ (1 - value)
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """Two states of the cameras on held-out surface: (before, after) spread of features and photograph edge at mesh edges, gains
+    and their standard errors."""
+
+    spread: tuple[float, float]
+    gain: float
+    error: float
+    edges: tuple[float, float]
+    edge_gain: float
+    edge_error: float
+
+    @property
+    def pays(self) -> bool:
+        """The second is better by both measures together, and much worse by none (Eq. C.32)."""
+        pairs = (self.gain, self.error), (self.edge_gain, self.edge_error)
+        return combined(pairs) > SURE and min(_standardised(pairs), default=0.0) > -SURE
+
+
+def combined(pairs: Sequence[tuple[float, float]]) -> float:
+    """Combine gains, given with their standard errors, by Stouffer's method: the sum of the n gains in standard errors over
+    sqrt(n). One of infinite error counts for nothing.
+
+    >>> round(combined([(0.3, 0.1), (0.01, 0.01), (5.0, float("inf"))]), 3)
+    2.828
+    """
+    z = _standardised(pairs)
+    return float(np.sum(z) / np.sqrt(max(len(z), 1)))
+
+
+def _standardised(pairs: Sequence[tuple[float, float]]) -> list[float]:
+    return [gain / max(error, 1e-12) for gain, error in pairs if error < np.inf]
+
+
+def _compare(
+    photos: Sequence[Photo],
+    maps: Sequence[_Maps],
+    states: tuple[_Cameras, _Cameras],
+    rows: _Rows,
+    edges: Sequence[np.ndarray],
+) -> _Comparison:
+    return _Comparison(*_compare_features(photos, maps, states, rows), *_compare_edges(photos, maps, states, edges))
 
 
 def _compare_features(
@@ -611,7 +705,7 @@ def _motion(photos: Sequence[Photo], before: _Cameras, after: _Cameras, v: int) 
 
 
 def _by_cluster(loss: np.ndarray, cluster: np.ndarray) -> tuple[float, float]:
-    """Mean, and its standard error when the rows of a cluster are correlated."""
+    """Mean, and its standard error when the rows of a cluster are correlated; infinite for fewer than two clusters."""
     if not len(loss):
         return 0.0, np.inf
     total, count = np.bincount(cluster, loss), np.bincount(cluster)
@@ -619,4 +713,4 @@ def _by_cluster(loss: np.ndarray, cluster: np.ndarray) -> tuple[float, float]:
     # Variance of the sums over clusters, with the correction for a small number of them.
     spread = (total - mean * count)[count > 0]
     size = len(spread)
-    return mean, float(np.sqrt((spread**2).sum() * size / max(size - 1, 1)) / count.sum())
+    return mean, float(np.sqrt((spread**2).sum() * size / (size - 1)) / count.sum()) if size > 1 else np.inf

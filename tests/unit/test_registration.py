@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter1d
 
-from iif_core.camera.registration import Photo, feature_image, mesh_edges, register
+from iif_core.camera.registration import SURE, Photo, _Comparison, combined, feature_image, mesh_edges, register
 from tests.errors import refused
 from tests.unit.painted_room import FOCAL, look, off, posed, room, twisted
 
@@ -59,6 +59,36 @@ def test_a_common_shift_of_the_principal_point_is_found(photos: list[Photo]) -> 
     np.testing.assert_allclose(found.principal * FOCAL, [2.0, -1.5], atol=0.3)
     assert abs(found.focal - 1) < 0.01
     np.testing.assert_allclose(found.moved, 2.5, atol=0.3)  # every pixel moves by the hypotenuse
+
+
+def test_an_error_that_all_cameras_share_is_corrected_alike(photos: list[Photo]) -> None:
+    """A turn of two pixels between camera and pose, as of a colour camera beside the depth camera that made the mesh."""
+    wrong = posed(photos, [twisted(p.pose, np.array([0.0, 0.02, 0.004]), np.array([0.01, 0.0, 0.0])) for p in photos])
+    wrong[3] = replace(wrong[3], held=True, image=np.zeros_like(wrong[3].image))
+    found = register(wrong, points=4000, intrinsics=False)
+    assert found.accepted and not found.each and found.evidence > SURE
+    before, after = off(np.array([p.pose for p in wrong]), photos), off(found.pose, photos)
+    assert before.min() > 1.5
+    # A held-out photograph of nothing moves with the others.
+    assert after.max() < 0.5
+    motion = np.array([np.linalg.inv(p.pose) @ pose for p, pose in zip(wrong, found.pose, strict=True)])
+    np.testing.assert_allclose(motion, np.broadcast_to(motion[0], motion.shape), atol=1e-12)
+
+
+def test_evidence_is_that_of_both_measures_together() -> None:
+    assert combined([(0.3, 0.1), (0.4, 0.1)]) == pytest.approx(7 / np.sqrt(2))
+    assert combined([(0.3, 0.1), (9.0, np.inf)]) == pytest.approx(3.0) and combined([(1.0, np.inf)]) == 0.0
+    rng = np.random.default_rng(0)
+    draws = [combined([(z, 1.0), (2.0 * w, 2.0)]) for z, w in rng.normal(size=(4000, 2))]
+    assert np.std(draws) == pytest.approx(1.0, abs=0.05)  # of nothing, it is a standard normal variable
+
+
+@pytest.mark.parametrize(
+    "texture, edges, pays",
+    [(5.0, 0.0, True), (4.0, 0.0, False), (-2.0, 14.0, True), (-4.0, 14.0, False), (14.0, -4.0, False), (2.0, 2.0, False)],
+)
+def test_a_correction_pays_that_is_surely_better_and_much_worse_in_nothing(texture: float, edges: float, pays: bool) -> None:
+    assert _Comparison((1.0, 1.0), 0.1 * texture, 0.1, (0.5, 0.5), 0.01 * edges, 0.01).pays == pays
 
 
 def test_what_is_right_is_left_alone(photos: list[Photo]) -> None:

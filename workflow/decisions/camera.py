@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.camera.gains import SIGNIFICANT, Evidence
+from iif_core.camera.registration import SURE
 from workflow.decisions.record import FORCED, Decision, decision, not_probed
 
 EXPOSURE_LOG_RATIO = 0.05
@@ -16,29 +17,25 @@ RESPONSE_ERRORS = 2.0
 """Standard errors by which a larger family of responses must be better."""
 
 
-def registration(accepted: bool, gain: float, error: float, moved: float, left_out: int, views: int) -> Decision:
+def registration(accepted: bool, each: bool, evidence: float, moved: float, left_out: int, views: int) -> Decision:
     """Decide about corrected poses and intrinsics (`iif_core.camera.registration`).
 
     Args:
-        accepted: whether the correction was accepted.
-        gain, error: fall of the loss on held-out texture, and its standard error; where it is not significant, edges of the mesh
-            decide.
+        accepted: whether a correction was accepted; each: whether of each photograph for itself, and not of all alike.
+        evidence: standard errors by which texture and edges of the mesh fit better together, on surface that the fit did not see.
         moved: median over the views of the shift, in pixels of the given photographs.
         left_out: number of photographs that are left out; views: number of photographs.
 
     Returns:
         The decision.
     """
-    measure = "fall of the loss on texture that the fit did not see, in standard errors"
-    value = gain / error if error > 0 else 0.0
-    done = (
-        f"photographs moved by {moved:.1f} of their own pixels (median)"
-        if accepted
-        else f"moving them by {moved:.1f} pixels would not pay"
-    )
-    by = "the texture" if gain > SIGNIFICANT * error else "the fit of edges of the mesh"
-    reason = f"{done}{f', as {by} supports' if accepted else ''}; {left_out} of {views} left out as blurred or badly posed"
-    return decision("registration", accepted, measure, value, SIGNIFICANT, reason)
+    measure = "how much better texture and mesh edges fit on surface that the fit did not see, in standard errors"
+    if accepted:
+        done = f"photographs moved by {moved:.1f} of their own pixels (median), {'each for itself' if each else 'all alike'}"
+    else:
+        done = f"moving them by {moved:.1f} pixels would not pay"
+    reason = f"{done}; {left_out} of {views} left out as blurred or badly posed"
+    return decision("registration", accepted, measure, evidence, SURE, reason)
 
 
 def held_out(step: float, every: int, blocks: int, nearest: str) -> Decision:

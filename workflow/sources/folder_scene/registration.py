@@ -72,7 +72,7 @@ def register_frames(
             new_poses[i] = pose
             new_frames[i] = replace(frames[i], camera=_camera(frames[i], found), matrix=_matrix(pose, axes, metres))
     moved = float(np.median(found.moved[used]) * scale) if used else 0.0
-    decision = decisions.registration(found.accepted, found.gain, found.error, moved, len(left_out), len(used))
+    decision = decisions.registration(found.accepted, found.each, found.evidence, moved, len(left_out), len(used))
     facts, words = _facts(names, found, scale), _words(found, moved, plain)
     return Registered(new_frames, new_poses, left_out, facts, words, [decision])
 
@@ -114,6 +114,7 @@ def _facts(names: Mapping[str, int], found: Registration, scale: float) -> dict[
     }
     numbers = {
         "accepted": found.accepted,
+        "each": found.each,
         "focal_factor": found.focal,
         "principal_shift_focal": found.principal.tolist(),
         "texture_spread": list(found.held_out),
@@ -136,4 +137,5 @@ def _words(found: Registration, moved: float, plain: bool) -> list[str]:
     if not found.accepted:
         return [f"registration: poses and intrinsics taken as given; a correction by {moved:.1f} pixels would not pay: {numbers}"]
     common = f", focal length times {found.focal:.4f}" if plain else ""
-    return [f"registration: photographs moved by {moved:.1f} pixels (median){common}: {numbers}"]
+    how = "each for itself" if found.each else "all alike"
+    return [f"registration: photographs moved by {moved:.1f} pixels (median), {how}{common}: {numbers}"]
