@@ -46,7 +46,7 @@ class MeasuredErrors:
             borders mix into it, which falls with the root of the pixels; hue: error of the logarithm of a channel relative to
             the brightness.
         dielectric, metal: error of the roughness of what is taken for a non-metal, and for any other kind, that the fit does not
-            state. All these are halves of central 68 % intervals.
+            state; that a kind is wrong is part of it. All these are halves of central 68 % intervals.
         albedo, roughness, metallic: the factor lambda of each.
     """
 
@@ -131,11 +131,12 @@ def mixture_quantile(below: float, weight: NDArray, middle: NDArray, error: NDAr
 
 
 def conformal_factor(residual: ArrayLike, room: ArrayLike, until: ArrayLike = np.inf, probability: float = PROBABILITY) -> float:
-    """Return the least factor with which claims hold as often as `probability`, by split-conformal prediction (Eq. M.62).
+    """Return the least factor with which claims hold as often as `probability` (Eq. M.62).
 
-    With one room it is the ceil((n + 1) probability)-th smallest of n errors (Vovk et al. 2005): one more object, which weighs as
-    much as the mean of the others, counts as an error without limit. An interval that has grown to all values claims nothing, and
-    counts for nothing.
+    With one room where everything is claimed it is the split-conformal quantile, the ceil((n + 1) probability)-th smallest of n
+    errors (Vovk et al. 2005): one more object, which weighs as much as the mean of the others, counts as an error without limit.
+    An interval that has grown to all values claims nothing, and counts for nothing; then more may be held with a smaller factor
+    than with a larger one, and only rooms left out tell what it holds.
 
     Args:
         residual: (n,) factors >= 0 with which the intervals just reach the truth.
@@ -171,7 +172,7 @@ def conformal_factor(residual: ArrayLike, room: ArrayLike, until: ArrayLike = np
 
 
 def roughness_error(kinds: Kinds, errors: MeasuredErrors) -> NDArray:
-    """Return the errors (O, 3) of the roughness given each kind: that of its profile, and what was measured (Eq. M.60)."""
+    """Return the errors (O, 3) of the roughness of each kind: that of its profile, and what was measured (Eq. M.60)."""
     measured = np.array([errors.dielectric, errors.metal, errors.metal])
     return np.hypot(np.minimum(np.nan_to_num(kinds.deviation), _LARGEST), measured)
 

@@ -347,7 +347,8 @@ def document(told: Sequence[Room], found: Sequence[Mapping[str, float]], errors:
         shares = [row[name] for row in found if np.isfinite(row[name])]
         held[name] = {"pooled": float(np.mean(shares)), "lowest": min(shares), "highest": max(shares)}
         held[name]["half_width"] = float(np.nanmean([row[f"{name}_width"] for row in found]))
-    numbers = {name: float(f"{value:.4g}") for name, value in vars(errors).items()}
+    # With less than its factor an object is lost, so factors are rounded up.
+    numbers = {name: _up(value) if name in HELD else float(f"{value:.4g}") for name, value in vars(errors).items()}
     held = {name: {key: round(value, 4) for key, value in entry.items()} for name, entry in held.items()}
     metals, inside = _metals(found)
     return {
@@ -357,6 +358,12 @@ def document(told: Sequence[Room], found: Sequence[Mapping[str, float]], errors:
         "rooms": len(found),
         "told_by": [room.scene for room in told],
     }
+
+
+def _up(value: float) -> float:
+    """Round a number above 0 up to four digits."""
+    step = 10.0 ** (np.floor(np.log10(value)) - 3)
+    return float(f"{np.ceil(value / step) * step:.4g}")
 
 
 def _metals(found: Sequence[Mapping[str, float]]) -> tuple[int, int]:

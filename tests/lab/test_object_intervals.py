@@ -62,6 +62,10 @@ def test_neither_ideal_captures_nor_the_rooms_of_the_gates_set_a_constant():
     assert set(measurement.KEPT_BACK) == set(gates.ROOMS)
 
 
+def test_factors_are_rounded_up():
+    assert [measurement._up(value) for value in (1.41306, 2.0, 0.99991, 12.3449)] == [1.414, 2.0, 1.0, 12.35]
+
+
 def test_too_few_objects_make_no_constants():
     with pytest.raises(InputError):
         measurement.fitted([room(0, objects=5)])

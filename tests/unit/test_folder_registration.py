@@ -52,6 +52,11 @@ def test_cameras_are_corrected_and_read_back(found):
     assert out.facts["accepted"] and "moved by" in out.notes[0]
     (decision,) = out.plan
     assert decision["included"] and decision["value"] > decision["threshold"] and "photographs moved by" in decision["reason"]
+    alike, other = ("all alike", "each for itself")[:: -1 if out.facts["each"] else 1]
+    for text in (decision["reason"], out.notes[0]):
+        assert alike in text and other not in text
+    moved = [np.linalg.inv(poses[k]) @ out.poses[k] for k in range(11)]
+    assert np.allclose(moved, moved[0], atol=1e-9) == (not out.facts["each"])
     json.dumps(out.facts, allow_nan=False)
     for frame, pose in zip(out.frames[:-1], out.poses[:-1], strict=True):
         np.testing.assert_allclose(opencv_pose(frame.matrix, "opengl", 0.001), pose, atol=1e-9)

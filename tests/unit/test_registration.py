@@ -6,9 +6,31 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.ndimage import uniform_filter1d
 
-from iif_core.camera.registration import SURE, Photo, _Comparison, combined, feature_image, mesh_edges, register
+from iif_core.camera.registration import (
+    MIN_VIEWS,
+    SIGMA_FOCAL,
+    SIGMA_PRINCIPAL,
+    SIGMA_ROTATION,
+    SIGMA_TRANSLATION,
+    SURE,
+    Gain,
+    Photo,
+    _Cameras,
+    _Comparison,
+    _each,
+    _edge_points,
+    _Maps,
+    _overlap,
+    _shared,
+    combined,
+    feature_image,
+    mesh_edges,
+    normal_equations,
+    register,
+)
 from tests.errors import refused
 from tests.unit.painted_room import FOCAL, look, off, posed, room, twisted
 
@@ -57,38 +79,106 @@ def test_a_common_shift_of_the_principal_point_is_found(photos: list[Photo]) -> 
     found = register(taken, points=4000, poses=False)
     assert found.accepted
     np.testing.assert_allclose(found.principal * FOCAL, [2.0, -1.5], atol=0.3)
-    assert abs(found.focal - 1) < 0.01
+    assert abs(found.focal - 1) < 0.01 and not found.each
     np.testing.assert_allclose(found.moved, 2.5, atol=0.3)  # every pixel moves by the hypotenuse
 
 
-def test_an_error_that_all_cameras_share_is_corrected_alike(photos: list[Photo]) -> None:
-    """A turn of two pixels between camera and pose, as of a colour camera beside the depth camera that made the mesh."""
-    wrong = posed(photos, [twisted(p.pose, np.array([0.0, 0.02, 0.004]), np.array([0.01, 0.0, 0.0])) for p in photos])
-    wrong[3] = replace(wrong[3], held=True, image=np.zeros_like(wrong[3].image))
-    found = register(wrong, points=4000, intrinsics=False)
+@pytest.fixture(scope="module")
+def turned(photos: list[Photo]) -> list[Photo]:
+    """All cameras turned by two pixels against their poses, as a colour camera beside the depth camera that made the mesh."""
+    return posed(photos, [twisted(p.pose, np.array([0.0, 0.02, 0.004]), np.array([0.01, 0.0, 0.0])) for p in photos])
+
+
+def motions(photos: list[Photo], poses: np.ndarray) -> np.ndarray:
+    """How each pose moved in the frame of its own camera."""
+    return np.array([np.linalg.inv(p.pose) @ pose for p, pose in zip(photos, poses, strict=True)])
+
+
+def test_an_error_that_all_cameras_share_is_corrected_alike(photos: list[Photo], turned: list[Photo]) -> None:
+    """A held-out photograph moves with the others, whatever it shows, and moves none of them."""
+    noise = np.random.default_rng(0).random(turned[3].image.shape)
+    found, other = (
+        register(
+            [replace(p, held=True, image=image) if k == 3 else p for k, p in enumerate(turned)], points=4000, intrinsics=False
+        )
+        for image in (noise, turned[3].image)
+    )
     assert found.accepted and not found.each and found.evidence > SURE
+    assert off(np.array([p.pose for p in turned]), photos).min() > 1.5 and off(found.pose, photos).max() < 0.5
+    moved = motions(turned, found.pose)
+    np.testing.assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=1e-12)
+    np.testing.assert_array_equal(found.pose, other.pose)
+
+
+def test_five_photographs_are_too_few_to_judge(turned: list[Photo]) -> None:
+    found = register(turned[::2], points=4000)
+    assert len(turned[::2]) == MIN_VIEWS - 1
+    assert not found.accepted and not found.each and found.evidence == 0.0 and found.moved.max() > 0.5
+
+
+def test_a_shared_direction_is_the_sum_of_those_of_the_views_with_one_prior(turned: list[Photo]) -> None:
+    """Along directions D of no held-out view, the equations are D^T N D and D^T r with the prior of one camera."""
+    views, features = len(turned), [feature_image(p.image, p.usable) for p in turned]
+    state = _Cameras.of(turned).moved(np.r_[np.tile([0.004, -0.002, 0.001, 0.003, 0.001, -0.002], views), 0.001, 0.002, 0.003])
+    maps, rows = [_Maps.of(f, 1.2) for f in features], _overlap(turned, features, 2000)
+    edges, together = [_edge_points(p) for p in turned], _shared(views, True, True)
+    own, right = normal_equations(turned, maps, state, rows, edges, _each(views, True, True))
+    alike, sums = normal_equations(turned, maps, state, rows, edges, together)
+    weight = max(len(rows.view) / views / 200.0, 1.0)
+    prior = weight / np.r_[np.repeat([SIGMA_ROTATION, SIGMA_TRANSLATION], 3), [SIGMA_PRINCIPAL] * 2, SIGMA_FOCAL] ** 2
+    steps = np.r_[state.twist[0], state.principal, np.log(state.focal)]
+    of_views = np.r_[np.tile(prior[:6], views), prior[6:]]
+    before = np.r_[state.twist.ravel(), steps[6:]]
+    np.testing.assert_allclose(alike, together.T @ (own - np.diag(of_views)) @ together + np.diag(prior), rtol=1e-9)
+    np.testing.assert_allclose(sums, together.T @ (right + of_views * before) - prior * steps, rtol=1e-9)
+
+
+def test_poses_that_are_far_off_need_the_large_blur(photos: list[Photo]) -> None:
+    """From 3.5 pixels away the small blur alone finds nothing that pays."""
+    rng = np.random.default_rng(3)
+    wrong = posed(photos, [twisted(p.pose, rng.normal(0, 0.025, 3), rng.normal(0, 0.0175, 3)) for p in photos])
+    found = register(wrong, points=4000, intrinsics=False)
+    assert found.accepted and found.each
     before, after = off(np.array([p.pose for p in wrong]), photos), off(found.pose, photos)
-    assert before.min() > 1.5
-    # A held-out photograph of nothing moves with the others.
-    assert after.max() < 0.5
-    motion = np.array([np.linalg.inv(p.pose) @ pose for p, pose in zip(wrong, found.pose, strict=True)])
-    np.testing.assert_allclose(motion, np.broadcast_to(motion[0], motion.shape), atol=1e-12)
+    assert np.median(before) > 3.0 and np.median(after) < 0.7 * np.median(before)
 
 
-def test_evidence_is_that_of_both_measures_together() -> None:
-    assert combined([(0.3, 0.1), (0.4, 0.1)]) == pytest.approx(7 / np.sqrt(2))
-    assert combined([(0.3, 0.1), (9.0, np.inf)]) == pytest.approx(3.0) and combined([(1.0, np.inf)]) == 0.0
+def test_the_gain_of_views_has_the_error_of_its_clusters() -> None:
     rng = np.random.default_rng(0)
-    draws = [combined([(z, 1.0), (2.0 * w, 2.0)]) for z, w in rng.normal(size=(4000, 2))]
-    assert np.std(draws) == pytest.approx(1.0, abs=0.05)  # of nothing, it is a standard normal variable
+    view, deviations = np.repeat(np.arange(40), 25), []
+    for _ in range(2000):
+        of_view = rng.normal(0.3, 1.0, 40)
+        found = Gain.of(np.repeat(of_view, 25), view, 40)
+        deviations.append((found.mean - 0.3) / found.error)
+    assert np.std(deviations) == pytest.approx(np.sqrt(39 / 37), abs=0.06)  # Student's t of 39 degrees of freedom
+    assert found.views == 40 and found.error == pytest.approx(np.std(of_view, ddof=1) / np.sqrt(40))
+    few = Gain.of(np.ones(125), view[:125], 40)
+    assert few.views == MIN_VIEWS - 1 and few.error == np.inf and few.mean == 1.0
+
+
+def test_gains_are_combined_with_what_they_share() -> None:
+    rng = np.random.default_rng(0)
+    texture, edge = rng.normal(size=(2, 4000, 60))
+    alone, both, twice = [], [], []
+    for t, e in zip(texture, edge, strict=True):
+        of = [Gain.of(values, np.arange(60), 60) for values in (t, 2.0 * e, 3.0 * t)]
+        alone.append(combined(of[:1])), both.append(combined(of[:2])), twice.append(combined(of[::2]))
+    assert twice == pytest.approx(alone)  # the same again is no more evidence
+    assert np.std(both) == pytest.approx(1.0, abs=0.04) == np.std(alone)
+    known, six = Gain.of(0.5 + texture[0], np.arange(60), 60), Gain.of(1.0 + texture[0][:6], np.arange(6), 6)
+    assert combined([six]) == pytest.approx(six.mean / six.error * SURE / stats.t.ppf(stats.norm.cdf(3.0), 5))
+    assert combined([known, Gain.of(np.zeros(0), np.zeros(0, int), 60)]) == combined([known]) and combined([]) == 0.0
 
 
 @pytest.mark.parametrize(
     "texture, edges, pays",
-    [(5.0, 0.0, True), (4.0, 0.0, False), (-2.0, 14.0, True), (-4.0, 14.0, False), (14.0, -4.0, False), (2.0, 2.0, False)],
+    [(8.0, 0.0, True), (6.0, 0.0, False), (-2.0, 14.0, True), (-4.0, 14.0, False), (14.0, -4.0, False), (3.0, 3.0, False)],
 )
 def test_a_correction_pays_that_is_surely_better_and_much_worse_in_nothing(texture: float, edges: float, pays: bool) -> None:
-    assert _Comparison((1.0, 1.0), 0.1 * texture, 0.1, (0.5, 0.5), 0.01 * edges, 0.01).pays == pays
+    rng = np.random.default_rng(0)
+    away = np.linalg.qr(rng.normal(size=(1000, 2)))[0].T  # what views add to one does not go with what they add to the other
+    first, second = (Gain(0.1 * z, 0.1, 0.1 * one, 1000) for z, one in zip((texture, edges), away, strict=True))
+    assert _Comparison((1.0, 1.0), first, (0.5, 0.5), second).pays == pays
 
 
 def test_what_is_right_is_left_alone(photos: list[Photo]) -> None:

@@ -21,7 +21,8 @@ def registration(accepted: bool, each: bool, evidence: float, moved: float, left
     """Decide about corrected poses and intrinsics (`iif_core.camera.registration`).
 
     Args:
-        accepted: whether a correction was accepted; each: whether of each photograph for itself, and not of all alike.
+        accepted: whether a correction was accepted.
+        each: whether photographs were moved each for itself, and not all alike.
         evidence: standard errors by which texture and edges of the mesh fit better together, on surface that the fit did not see.
         moved: median over the views of the shift, in pixels of the given photographs.
         left_out: number of photographs that are left out; views: number of photographs.
