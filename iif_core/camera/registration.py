@@ -24,9 +24,9 @@ DARK = 0.06
 """Luminance relative to the median below which texture counts as noise; an 8-bit photograph has some five levels there."""
 BLURS = (2.5, 1.2, 0.7)
 """Standard deviations of the successive blurs of the feature images, in pixels."""
-SURE = 5.0
-"""Standard errors of both measures together by which held-out surface must be better. They do not contain the errors of the mesh,
-which all views share: right poses reach 4.8 in rooms with truth, wrong ones 6 and more."""
+SURE, SURE_ALIKE = 4.0, 5.0
+"""Standard errors of both measures together by which held-out surface must be better: with views each for itself, and with what
+all share. The errors of the mesh, which all views share, are not in them: right poses reach 3.6 and 4.8 in rooms with truth."""
 WORSE = 3.0
 """Standard errors of its own by which neither measure may be worse."""
 STEPS_PER_BLUR = 6
@@ -202,10 +202,11 @@ def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = T
     few = fit.take(fit.point % SHARED_EVERY == 0), [world[::SHARED_EVERY] for world in seen]
     alike, each = _shared(len(photos), poses, intrinsics), _each(len(photos), poses, intrinsics)
     final, own = start, False
-    for blurs, data, directions in ((BLURS, few, alike), (BLURS[1:], (fit, seen), each), (BLURS, (fit, seen), each)):
+    stages = (BLURS, few, alike, SURE_ALIKE), (BLURS[1:], (fit, seen), each, SURE), (BLURS, (fit, seen), each, SURE)
+    for blurs, data, directions, sure in stages:
         state = _descend(photos, features, blurs, final, *data, directions)
         # Better than what was accepted before, and than the given cameras.
-        if all(_compare(photos, maps, (before, state), *judged).pays for before in (final, start)):
+        if all(_compare(photos, maps, (before, state), *judged).pays(sure) for before in (final, start)):
             final, own = state, poses and directions is each
     state = state if final is start else final
     found = _compare(photos, maps, (start, state), *judged)
@@ -620,7 +621,7 @@ def combined(gains: Sequence[Gain]) -> float:
     """Combine gains into one number of standard errors: the sum of each in its own, over the standard error of that sum, which
     contains how the gains go together over views. A gain of infinite error counts for nothing.
 
-    Where Student's t exceeds SURE as often as a normal variable exceeds 3, with six views or fewer, it is less by that ratio.
+    Where Student's t exceeds SURE as often as a normal variable exceeds 3, with ten views or fewer, it is less by that ratio.
     """
     known = [gain for gain in gains if gain.error < np.inf]
     if not known:
@@ -645,10 +646,9 @@ class _Comparison:
     def evidence(self) -> float:
         return combined([self.texture, self.edge])
 
-    @property
-    def pays(self) -> bool:
-        """The second is better by both measures together, and much worse by neither (Eq. C.32)."""
-        return self.evidence > SURE and all(gain.mean >= -WORSE * gain.error for gain in (self.texture, self.edge))
+    def pays(self, sure: float) -> bool:
+        """The second is better by both measures together, by more than `sure`, and much worse by neither (Eq. C.32)."""
+        return self.evidence > sure and all(gain.mean >= -WORSE * gain.error for gain in (self.texture, self.edge))
 
 
 def _compare(

@@ -178,7 +178,7 @@ def test_a_correction_pays_that_is_surely_better_and_much_worse_in_nothing(textu
     rng = np.random.default_rng(0)
     away = np.linalg.qr(rng.normal(size=(1000, 2)))[0].T  # what views add to one does not go with what they add to the other
     first, second = (Gain(0.1 * z, 0.1, 0.1 * one, 1000) for z, one in zip((texture, edges), away, strict=True))
-    assert _Comparison((1.0, 1.0), first, (0.5, 0.5), second).pays == pays
+    assert _Comparison((1.0, 1.0), first, (0.5, 0.5), second).pays(5.0) == pays
 
 
 def test_what_is_right_is_left_alone(photos: list[Photo]) -> None:
