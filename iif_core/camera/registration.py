@@ -2,7 +2,7 @@
 
 The photographs have to agree with each other on surface points, and with the edges of the mesh (Eq. C.30). The texture values of
 the points are eliminated; steps are Gauss-Newton with Cauchy's weights, on images blurred less and less. First comes what all
-cameras share, then each camera for itself; what held-out surface does not confirm is undone.
+cameras share, then each camera beside the others, tightly first; what held-out surface does not confirm is undone.
 """
 
 from __future__ import annotations
@@ -17,7 +17,11 @@ from iif_core.camera.exposure import estimate_gains
 from iif_core.errors import InputError
 
 SIGMA_ROTATION, SIGMA_TRANSLATION = 0.02, 0.03
-"""Standard deviation of the correction that all views share, and of that of a view beside it: radians, metres."""
+"""Standard deviation of the correction that all views share, and the largest of that of a view beside the others: radians,
+metres."""
+WIDTHS = 0.03, 0.1, 0.3
+"""Standard deviations of the corrections of single views that are tried, in units of those two. Views are known to about a pixel,
+so a prior much wider than their errors adds noise to good poses, and a narrow one cannot mend bad ones."""
 SIGMA_PRINCIPAL, SIGMA_FOCAL = 0.02, 0.02
 """Standard deviation of the common corrections, relative to the focal length."""
 DARK = 0.06
@@ -25,8 +29,11 @@ DARK = 0.06
 BLURS = (2.5, 1.2, 0.7)
 """Standard deviations of the successive blurs of the feature images, in pixels."""
 SURE, SURE_ALIKE = 4.0, 5.0
-"""Standard errors of both measures together by which held-out surface must be better: with views each for itself, and with what
-all share. The errors of the mesh, which all views share, are not in them: right poses reach 3.6 and 4.8 in rooms with truth."""
+"""Standard errors of both measures together by which held-out surface must be better: with single views beside the others, and
+with what all share. The errors of the mesh, which all views share, are not in them: right poses reach 4.3 and 4.8 in rooms with
+truth. The first moves them by a tenth of a pixel, the second would by half a pixel."""
+BETTER = 2.0
+"""Standard errors by which a correction of single views must be better than a tighter one that is accepted."""
 WORSE = 3.0
 """Standard errors of its own by which neither measure may be worse."""
 STEPS_PER_BLUR = 6
@@ -81,7 +88,7 @@ class Registration:
         rows: (point, view) pairs compared.
         evidence: what held-out surface says for the correction, in standard errors (`combined`).
         accepted: whether a correction satisfies Eq. C.32; if none does, the other numbers are of the last that was tried.
-        each: whether the poses of the views are corrected each for itself, and not only all alike.
+        each: whether the poses of single views are corrected beside those of the others, and not only all alike.
         sharpness: (V,) gradient of the texture relative to the other views; 1 = typical, 0 = not compared, as all that are held.
         agreement: (V,) correlation of features with the mean of the other views, after registration; 0 = not compared.
         shift: (V,) remaining translation against the texture of the other views, in pixels (Eq. C.33).
@@ -198,16 +205,20 @@ def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = T
     judged = rows.take(rows.held_out), [world[h & own] for world, h, own in zip(edges, held, moving, strict=True)]
     maps = [_Maps.of(f, BLURS[-1]) for f in features]
 
-    # -------- Gauss-Newton: what all cameras share, then each camera from where it is, and from further away --------
+    # -------- Gauss-Newton: all cameras alike, then each beside the others, less and less tightly, then free --------
     few = fit.take(fit.point % SHARED_EVERY == 0), [world[::SHARED_EVERY] for world in seen]
-    alike, each = _shared(len(photos), poses, intrinsics), _each(len(photos), poses, intrinsics)
+    stages = [(BLURS, few, together(len(photos), poses, intrinsics), SURE_ALIKE)]
+    if poses:
+        stages += [(BLURS[1:], (fit, seen), apart(moving, width), SURE) for width in WIDTHS]
+        # Only this one comes from so far away that a wide blur is needed.
+        stages += [(BLURS, (fit, seen), free(len(photos), intrinsics), SURE)]
     final, own = start, False
-    stages = (BLURS, few, alike, SURE_ALIKE), (BLURS[1:], (fit, seen), each, SURE), (BLURS, (fit, seen), each, SURE)
-    for blurs, data, directions, sure in stages:
-        state = _descend(photos, features, blurs, final, *data, directions)
-        # Better than what was accepted before, and than the given cameras.
-        if all(_compare(photos, maps, (before, state), *judged).pays(sure) for before in (final, start)):
-            final, own = state, poses and directions is each
+    for blurs, data, unknowns, sure in stages:
+        state = _descend(photos, features, blurs, final, *data, unknowns)
+        # Surely better than the given cameras and than what all share; between corrections of single views less decides.
+        limits = [(final, BETTER if own else sure)] + [(start, sure)] * (final is not start)
+        if all(_compare(photos, maps, (earlier, state), *judged).pays(limit) for earlier, limit in limits):
+            final, own = state, unknowns is not stages[0][2]
     state = state if final is start else final
     found = _compare(photos, maps, (start, state), *judged)
     return Registration(
@@ -229,17 +240,55 @@ def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = T
     )
 
 
-def _shared(views: int, poses: bool, intrinsics: bool) -> np.ndarray:
-    """Return the directions (6 V + 3, n) in which all cameras move alike: one twist in their own frames, and the intrinsics."""
-    unknowns = np.zeros((6 * views + 3, 9))
-    unknowns[: 6 * views, :6] = np.tile(np.eye(6), (views, 1))
-    unknowns[6 * views :, 6:] = np.eye(3)
-    return unknowns[:, np.r_[np.repeat(poses, 6), np.repeat(intrinsics, 3)].astype(bool)]
+_PRIOR = np.repeat([SIGMA_ROTATION, SIGMA_TRANSLATION], 3), np.array([SIGMA_PRINCIPAL, SIGMA_PRINCIPAL, SIGMA_FOCAL])
 
 
-def _each(views: int, poses: bool, intrinsics: bool) -> np.ndarray:
-    """Return the directions (6 V + 3, n) in which every camera moves for itself: a twist of each, and the common intrinsics."""
-    return np.eye(6 * views + 3)[:, np.r_[np.repeat(poses, 6 * views), np.repeat(intrinsics, 3)].astype(bool)]
+@dataclass(frozen=True)
+class Unknowns:
+    """The unknowns of a descent: cameras move along some directions.
+
+    Attributes:
+        directions: (6 V + 3, n) orthogonal columns: twists of the views, principal point, log focal length.
+        sigma: (n,) standard deviation of the prior of the motion along each.
+    """
+
+    directions: np.ndarray
+    sigma: np.ndarray
+
+
+def together(views: int, poses: bool, intrinsics: bool) -> Unknowns:
+    """Return the unknowns with which all cameras move alike: one twist in their own frames, and the intrinsics."""
+    directions = np.zeros((6 * views + 3, 9))
+    directions[: 6 * views, :6] = np.tile(np.eye(6), (views, 1))
+    directions[6 * views :, 6:] = np.eye(3)
+    chosen = np.r_[np.repeat(poses, 6), np.repeat(intrinsics, 3)].astype(bool)
+    return Unknowns(directions[:, chosen], np.concatenate(_PRIOR)[chosen])
+
+
+def apart(moving: np.ndarray, width: float) -> Unknowns:
+    """Return the unknowns with which cameras move beside each other: a twist of each, of which those that are not held have mean
+    zero, because errors of the mesh hide their mean.
+
+    Args:
+        moving: (V,) bool, which views are not held; one that is held moves for itself.
+        width: standard deviation of the prior, in units of SIGMA_ROTATION and SIGMA_TRANSLATION.
+    """
+    from scipy.linalg import block_diag, helmert
+
+    count = int(moving.sum())
+    # Rows of Helmert's matrix are orthonormal contrasts: each camera against the mean of those before it.
+    contrasts = block_diag(helmert(count).T if count else np.zeros((0, 0)), np.eye(len(moving) - count))
+    of_views = np.zeros_like(contrasts)
+    of_views[np.r_[np.flatnonzero(moving), np.flatnonzero(~moving)]] = contrasts
+    directions = np.kron(of_views, np.eye(6))
+    sigma = width * np.tile(_PRIOR[0], of_views.shape[1])
+    return Unknowns(np.concatenate([directions, np.zeros((3, directions.shape[1]))]), sigma)
+
+
+def free(views: int, intrinsics: bool) -> Unknowns:
+    """Return the unknowns with which every camera moves for itself: a twist of each, and the common intrinsics."""
+    chosen = np.r_[np.repeat(True, 6 * views), np.repeat(intrinsics, 3)]
+    return Unknowns(np.eye(len(chosen))[:, chosen], np.r_[np.tile(_PRIOR[0], views), _PRIOR[1]][chosen])
 
 
 def _descend(
@@ -249,16 +298,16 @@ def _descend(
     start: _Cameras,
     rows: _Rows,
     edges: Sequence[np.ndarray],
-    directions: np.ndarray,
+    unknowns: Unknowns,
 ) -> _Cameras:
-    """Move cameras along directions (6 V + 3, n) by Gauss-Newton, from blurred to sharp images."""
+    """Move cameras by Gauss-Newton, from blurred to sharp images."""
     # The prior pulls each view towards where this descent starts, and the intrinsics towards the given ones.
     state = replace(start, twist=np.zeros_like(start.twist))
     # A linear model of an image holds within its blur: wide blurs bring cameras close, narrow ones make them precise.
-    for blur in blurs if directions.shape[1] else ():
+    for blur in blurs if len(unknowns.sigma) else ():
         maps = [_Maps.of(f, blur) for f in features]
         for _ in range(STEPS_PER_BLUR):
-            state = state.moved(_step(photos, maps, state, rows, edges, directions))
+            state = state.moved(_step(photos, maps, state, rows, edges, unknowns))
     return state
 
 
@@ -482,11 +531,11 @@ def _step(
     state: _Cameras,
     rows: _Rows,
     edges: Sequence[np.ndarray],
-    directions: np.ndarray,
+    unknowns: Unknowns,
 ) -> np.ndarray:
     """Compute one Gauss-Newton step (6 V + 3,): twists, principal point, log focal length."""
-    normal, right = normal_equations(photos, maps, state, rows, edges, directions)
-    step = directions @ np.linalg.solve(normal, right)
+    normal, right = normal_equations(photos, maps, state, rows, edges, unknowns)
+    step = unknowns.directions @ np.linalg.solve(normal, right)
     # rad, m, and units of the focal length. The step takes images for linear, which holds over short distances only.
     limit = np.r_[np.tile(np.repeat([0.02, 0.03], 3), len(photos)), [0.02, 0.02, 0.02]]
     return np.clip(step, -limit, limit)
@@ -498,10 +547,9 @@ def normal_equations(
     state: _Cameras,
     rows: _Rows,
     edges: Sequence[np.ndarray],
-    directions: np.ndarray,
+    unknowns: Unknowns,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the matrix (n, n) and the right-hand side of a step along directions (6 V + 3, n): texture values eliminated, prior
-    added."""
+    """Return the matrix (n, n) and the right-hand side of a step along n directions: texture values eliminated, prior added."""
     from scipy.sparse import coo_matrix
 
     views = len(photos)
@@ -534,33 +582,28 @@ def normal_equations(
     matrix = coo_matrix((entries.ravel(), (np.repeat(number, 9), columns.ravel())), (len(value), size)).tocsr()
 
     # -------- levels of the points eliminated --------
-    # For fixed cameras C_s is the weighted mean of its rows, so its derivative is the weighted mean of theirs. It is taken from
-    # each of them.
+    # For fixed cameras C_s is the weighted mean of its rows, so its derivative is the weighted mean of theirs: what a level
+    # explains is taken from the matrix. Levels are constants for a held-out photograph, so that its rows move no other camera.
     level = weight * moving
     total = np.maximum(np.bincount(rows.point, level), 1e-9)
     pooled = coo_matrix((level, (rows.point, number)), (len(total), len(value))).tocsr() @ matrix
-    pooled = pooled.multiply(1.0 / total[:, None]).tocsr()
-    # The levels are constants for a held-out photograph, so that its rows do not move the other cameras.
-    centred = matrix - pooled[rows.point].multiply(moving[:, None]).tocsr()
-    weighted = centred.multiply(weight[:, None]).tocsr()
-    normal = np.asarray((centred.T @ weighted).todense())
-    right = -np.asarray(weighted.T @ (value - mean)).ravel()
+    normal = (matrix.T @ matrix.multiply(weight[:, None]) - pooled.T @ pooled.multiply(1.0 / total[:, None])).toarray()
+    # Residuals from their level have no weighted mean over a point, so the level's derivative drops out here.
+    right = -(matrix.T @ (weight * (value - mean)))
 
     # -------- edges and priors, second to fourth sum of Eq. C.30 --------
     _add_edges(photos, maps, state, edges, normal, right)
     # What a held-out photograph shows moves its own camera, and no direction that others share.
-    own = np.repeat([not p.held for p in photos], 6)
+    directions, own = unknowns.directions, np.repeat([not p.held for p in photos], 6)
     shared = (directions[: 6 * views] != 0).sum(0) > 1
     used = directions.copy()
     used[: 6 * views, shared] *= own[:, None]
     normal, right = used.T @ normal @ used, used.T @ right
-    sigma = np.r_[np.tile(np.repeat([SIGMA_ROTATION, SIGMA_TRANSLATION], 3), views), [SIGMA_PRINCIPAL] * 2, SIGMA_FOCAL]
-    # A direction is one unknown, whose standard deviation is that of each camera; the steps so far are its mean over cameras.
-    count = directions.sum(0)
-    sigma = (directions.T @ sigma) / count
-    so_far = (directions.T @ np.r_[state.twist.ravel(), state.principal, np.log(state.focal)]) / count
+    # All steps so far, along each direction.
+    steps = np.r_[state.twist.ravel(), state.principal, np.log(state.focal)]
+    so_far = (directions.T @ steps) / (directions**2).sum(0)
     rows_of_view = moving.sum() / max(sum(not p.held for p in photos), 1)
-    precision = max(rows_of_view / 200.0, 1.0) / sigma**2  # the errors of neighbouring rows are correlated
+    precision = max(rows_of_view / 200.0, 1.0) / unknowns.sigma**2  # the errors of neighbouring rows are correlated
     # The prior pulls towards the start, hence towards the negative sum of all steps so far.
     return normal + np.diag(precision), right - precision * so_far
 

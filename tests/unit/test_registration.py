@@ -9,27 +9,30 @@ import pytest
 from scipy import stats
 from scipy.ndimage import uniform_filter1d
 
+from iif_core.camera import registration
 from iif_core.camera.registration import (
     MIN_VIEWS,
-    SIGMA_FOCAL,
-    SIGMA_PRINCIPAL,
     SIGMA_ROTATION,
     SIGMA_TRANSLATION,
     SURE,
     Gain,
     Photo,
+    Unknowns,
+    _camera_points,
     _Cameras,
     _Comparison,
-    _each,
     _edge_points,
     _Maps,
     _overlap,
-    _shared,
+    _project,
+    apart,
     combined,
     feature_image,
+    free,
     mesh_edges,
     normal_equations,
     register,
+    together,
 )
 from tests.errors import refused
 from tests.unit.painted_room import FOCAL, look, off, posed, room, twisted
@@ -116,21 +119,94 @@ def test_five_photographs_are_too_few_to_judge(turned: list[Photo]) -> None:
     assert not found.accepted and not found.each and found.evidence == 0.0 and found.moved.max() > 0.5
 
 
-def test_a_shared_direction_is_the_sum_of_those_of_the_views_with_one_prior(turned: list[Photo]) -> None:
-    """Along directions D of no held-out view, the equations are D^T N D and D^T r with the prior of one camera."""
+@pytest.mark.parametrize("unknowns", [together(10, True, True), apart(np.ones(10, bool), 0.1), apart(np.arange(10) != 4, 1.0)])
+def test_equations_along_directions_are_those_of_the_views(turned: list[Photo], unknowns: Unknowns) -> None:
+    """Along directions D of no held-out view, the equations are D^T N D and D^T r with the prior of the directions."""
     views, features = len(turned), [feature_image(p.image, p.usable) for p in turned]
     state = _Cameras.of(turned).moved(np.r_[np.tile([0.004, -0.002, 0.001, 0.003, 0.001, -0.002], views), 0.001, 0.002, 0.003])
     maps, rows = [_Maps.of(f, 1.2) for f in features], _overlap(turned, features, 2000)
-    edges, together = [_edge_points(p) for p in turned], _shared(views, True, True)
-    own, right = normal_equations(turned, maps, state, rows, edges, _each(views, True, True))
-    alike, sums = normal_equations(turned, maps, state, rows, edges, together)
+    edges, each = [_edge_points(p) for p in turned], free(views, True)
+    own, right = normal_equations(turned, maps, state, rows, edges, each)
+    found, sums = normal_equations(turned, maps, state, rows, edges, unknowns)
     weight = max(len(rows.view) / views / 200.0, 1.0)
-    prior = weight / np.r_[np.repeat([SIGMA_ROTATION, SIGMA_TRANSLATION], 3), [SIGMA_PRINCIPAL] * 2, SIGMA_FOCAL] ** 2
-    steps = np.r_[state.twist[0], state.principal, np.log(state.focal)]
-    of_views = np.r_[np.tile(prior[:6], views), prior[6:]]
-    before = np.r_[state.twist.ravel(), steps[6:]]
-    np.testing.assert_allclose(alike, together.T @ (own - np.diag(of_views)) @ together + np.diag(prior), rtol=1e-9)
-    np.testing.assert_allclose(sums, together.T @ (right + of_views * before) - prior * steps, rtol=1e-9)
+    of_views, prior = weight / each.sigma**2, weight / unknowns.sigma**2
+    steps, directions = np.r_[state.twist.ravel(), state.principal, np.log(state.focal)], unknowns.directions
+    along = np.linalg.lstsq(directions, steps, rcond=None)[0]  # the coordinates of all steps so far
+    np.testing.assert_allclose(
+        found, directions.T @ (own - np.diag(of_views)) @ directions + np.diag(prior), rtol=1e-9, atol=1e-6
+    )
+    np.testing.assert_allclose(sums, directions.T @ (right + of_views * steps) - prior * along, rtol=1e-9, atol=1e-6)
+
+
+def test_a_step_is_that_of_least_squares_over_cameras_and_levels(turned: list[Photo]) -> None:
+    """With the level of every point as an unknown beside the cameras, a dense solver finds the same equations."""
+    views, features = len(turned), [feature_image(p.image, p.usable) for p in turned]
+    kept = [replace(p, held=k == 3) for k, p in enumerate(turned)]
+    maps, rows = [_Maps.of(f, 1.2) for f in features], _overlap(kept, features, 300)
+    state, unknowns, none = _Cameras.of(kept), free(views, True), [np.zeros((0, 3))] * views
+    found, right = normal_equations(kept, maps, state, rows, none, unknowns)
+
+    def at(name: str, step: np.ndarray) -> np.ndarray:
+        """Image coordinates, or a map there, of each (point, view)."""
+        moved = state.moved(step)
+        places = [
+            _project(kept[v], moved, _camera_points(moved, v, world[None]))
+            for v, world in zip(rows.view, rows.world, strict=True)
+        ]
+        if name == "uv":
+            return np.concatenate(places)
+        return np.array([maps[v].at((name,), place)[0][0] for v, place in zip(rows.view, places, strict=True)])
+
+    size = 6 * views + 3
+    still = np.zeros(size)
+    value, slope = at("value", still), np.stack([at("du", still), at("dv", still)], -1)
+    moving = rows.view != 3
+    total = np.bincount(rows.point, moving)
+    residual = value - (np.bincount(rows.point, value * moving) / total)[rows.point]
+    scale = 1.4826 * np.median(np.abs(residual[moving]))
+    weight = 1 / (1 + (residual / (2.385 * scale)) ** 2) / scale**2
+    # Finite differences of the image coordinates; a held-out photograph leaves the intrinsics as they are.
+    slopes = np.stack([((at("uv", 1e-6 * one) - at("uv", still)) * slope).sum(1) / 1e-6 for one in np.eye(size)], -1)
+    slopes[:, 6 * views :] *= moving[:, None]
+    # A held-out photograph sees the levels as they are: its rows have no derivative by them.
+    levels = np.zeros((len(value), len(total)))
+    levels[np.arange(len(value)), rows.point] = -1.0 * moving
+    whole = np.concatenate([slopes, levels], 1)
+    big = whole.T @ (weight[:, None] * whole)
+    eliminated = big[:size, :size] - big[:size, size:] @ np.linalg.solve(big[size:, size:], big[size:, :size])
+    prior = max(moving.sum() / (views - 1) / 200.0, 1.0) / unknowns.sigma**2
+    np.testing.assert_allclose(found - np.diag(prior), eliminated, rtol=1e-3, atol=1e-4 * np.abs(eliminated).max())
+    level = (np.bincount(rows.point, weight * moving * value) / np.bincount(rows.point, weight * moving))[rows.point]
+    np.testing.assert_allclose(right, -slopes.T @ (weight * (value - level)), atol=1e-4 * np.abs(right).max())
+
+
+def test_cameras_that_move_beside_each_other_have_no_mean_motion() -> None:
+    moving = np.arange(7) != 2
+    unknowns = apart(moving, 0.1)
+    directions = unknowns.directions
+    assert directions.shape == (45, 36)
+    np.testing.assert_allclose(directions.T @ directions, np.eye(36), atol=1e-12)
+    of_views = directions[:42].reshape(7, 6, 36)
+    np.testing.assert_allclose(of_views[moving].sum(0), 0, atol=1e-12)
+    assert np.linalg.matrix_rank(of_views[2]) == 6 and not directions[42:].any()  # the held-out one moves for itself
+    assert not of_views[moving][:, :, of_views[2].any(0)].any()
+    assert (
+        unknowns.sigma.reshape(-1, 6).tolist() == [pytest.approx([0.1 * SIGMA_ROTATION] * 3 + [0.1 * SIGMA_TRANSLATION] * 3)] * 6
+    )
+    assert apart(np.array([True]), 1.0).directions.shape == (9, 0)
+    assert apart(np.array([False, False]), 1.0).directions.shape == (15, 12)
+
+
+def test_small_errors_of_single_views_are_corrected_beside_each_other(photos: list[Photo]) -> None:
+    """Half a pixel each: less than what free views are known to, so the narrow priors are needed."""
+    rng = np.random.default_rng(4)
+    wrong = posed(photos, [twisted(p.pose, rng.normal(0, 0.005, 3), rng.normal(0, 0.003, 3)) for p in photos])
+    found = register(wrong, points=4000)
+    assert found.accepted and found.each
+    before, after = off(np.array([p.pose for p in wrong]), photos), off(found.pose, photos)
+    assert np.median(before) > 0.7 and np.median(after) < 0.3 and after.max() < 0.6
+    # The first correction that pays leaves the mean of the twists, which the errors of the mesh hide, where it was.
+    np.testing.assert_allclose(np.mean([motion[:3, 3] for motion in motions(wrong, found.pose)], 0), 0, atol=1e-4)
 
 
 def test_poses_that_are_far_off_need_the_large_blur(photos: list[Photo]) -> None:
@@ -179,6 +255,40 @@ def test_a_correction_pays_that_is_surely_better_and_much_worse_in_nothing(textu
     away = np.linalg.qr(rng.normal(size=(1000, 2)))[0].T  # what views add to one does not go with what they add to the other
     first, second = (Gain(0.1 * z, 0.1, 0.1 * one, 1000) for z, one in zip((texture, edges), away, strict=True))
     assert _Comparison((1.0, 1.0), first, (0.5, 0.5), second).pays(5.0) == pays
+
+
+@pytest.mark.parametrize(
+    "evidence, accepted",
+    [
+        ({(0, 1): 5.5, (1, 2): 3.5, (0, 2): 9.0}, 1),  # single views must surely be better than what all share
+        ({(0, 1): 4.5, (0, 2): 4.5}, 2),  # what all share needs more evidence than single views
+        ({(0, 2): 4.5, (2, 3): 2.5, (0, 3): 4.5}, 3),  # between corrections of single views less decides
+        ({(0, 2): 4.5, (2, 3): 1.5, (0, 3): 4.5}, 2),
+        ({(0, 2): 4.5, (2, 3): 2.5, (0, 3): 3.5}, 2),  # but each is surely better than the given cameras
+        ({(0, 5): 4.5}, 5),
+        ({}, 0),
+    ],
+)
+def test_which_correction_is_accepted(
+    photos: list[Photo], monkeypatch: pytest.MonkeyPatch, evidence: dict[tuple[int, int], float], accepted: int
+) -> None:
+    """Corrections are numbered in the order in which they are tried; `evidence` is of the second of a pair against the first."""
+    tried = iter(range(1, 9))
+
+    def descend(photos: list[Photo], features: object, blurs: object, start: _Cameras, *rest: object) -> _Cameras:
+        return replace(start, focal=1.0 + 1e-6 * next(tried))
+
+    def compare(photos: list[Photo], maps: object, states: tuple[_Cameras, _Cameras], *rest: object) -> _Comparison:
+        z = evidence.get(tuple(round((state.focal - 1.0) * 1e6) for state in states), 0.0)
+        return _Comparison(
+            (1.0, 1.0), Gain(0.1 * z, 0.1, np.full(100, 0.01), 1000), (0.0, 0.0), Gain(0.0, np.inf, np.zeros(100), 0)
+        )
+
+    monkeypatch.setattr(registration, "_descend", descend)
+    monkeypatch.setattr(registration, "_compare", compare)
+    found = register(photos, points=400)
+    assert found.accepted == (accepted > 0) and found.each == (accepted > 1)
+    assert round((found.focal - 1.0) * 1e6) == (accepted or 5)  # the last that was tried, if none is
 
 
 def test_what_is_right_is_left_alone(photos: list[Photo]) -> None:
