@@ -2,7 +2,8 @@
 
 The photographs have to agree with each other on surface points, and with the edges of the mesh (Eq. C.30). The texture values of
 the points are eliminated; steps are Gauss-Newton with Cauchy's weights, on images blurred less and less. First comes what all
-cameras share, then each camera beside the others, tightly first; what held-out surface does not confirm is undone.
+cameras share, then each camera beside the others, tightly first, at last each freely; what held-out surface does not confirm is
+undone.
 """
 
 from __future__ import annotations
@@ -17,23 +18,24 @@ from iif_core.camera.exposure import estimate_gains
 from iif_core.errors import InputError
 
 SIGMA_ROTATION, SIGMA_TRANSLATION = 0.02, 0.03
-"""Standard deviation of the correction that all views share, and the largest of that of a view beside the others: radians,
-metres."""
+"""Standard deviation of the correction that all views share, and of that of a free view: radians, metres."""
 WIDTHS = 0.03, 0.1, 0.3
-"""Standard deviations of the corrections of single views that are tried, in units of those two. Views are known to about a pixel,
-so a prior much wider than their errors adds noise to good poses, and a narrow one cannot mend bad ones."""
+"""Standard deviations, in units of those two, of the steps by which views may move beside each other, one after the other. Views
+are known to about a pixel, so a prior much wider than their errors adds noise to good poses, and a narrow one cannot mend bad
+ones."""
 SIGMA_PRINCIPAL, SIGMA_FOCAL = 0.02, 0.02
 """Standard deviation of the common corrections, relative to the focal length."""
+_PRIOR = np.repeat([SIGMA_ROTATION, SIGMA_TRANSLATION], 3), np.array([SIGMA_PRINCIPAL, SIGMA_PRINCIPAL, SIGMA_FOCAL])
 DARK = 0.06
 """Luminance relative to the median below which texture counts as noise; an 8-bit photograph has some five levels there."""
 BLURS = (2.5, 1.2, 0.7)
 """Standard deviations of the successive blurs of the feature images, in pixels."""
 SURE, SURE_ALIKE = 4.0, 5.0
-"""Standard errors of both measures together by which held-out surface must be better: with single views beside the others, and
-with what all share. The errors of the mesh, which all views share, are not in them: right poses reach 4.3 and 4.8 in rooms with
-truth. The first moves them by a tenth of a pixel, the second would by half a pixel."""
+"""Standard errors of both measures together by which held-out surface must be better: with corrections of single views, and with
+what all share. The errors of the mesh, which all views share, are not in them. Of right poses, the first reach 4.3, which moves
+two rooms of fifteen by a tenth of a pixel and is allowed to, and the second 4.8, which would move them by half a pixel."""
 BETTER = 2.0
-"""Standard errors by which a correction of single views must be better than a tighter one that is accepted."""
+"""Standard errors by which views that move less tightly must be better than the tighter ones that were accepted."""
 WORSE = 3.0
 """Standard errors of its own by which neither measure may be worse."""
 STEPS_PER_BLUR = 6
@@ -86,8 +88,10 @@ class Registration:
         edges: (before, after) mean photograph edge at held-out edges of the mesh.
         edge_gain, edge_error: its increase and the standard error over views.
         rows: (point, view) pairs compared.
-        evidence: what held-out surface says for the correction, in standard errors (`combined`).
-        accepted: whether a correction satisfies Eq. C.32; if none does, the other numbers are of the last that was tried.
+        evidence: what held-out surface says, in standard errors (`combined`), for the correction of single views against what all
+            share, or for what all share against the given cameras if single views stay.
+        needed: what it has to exceed.
+        accepted: whether a correction satisfies Eq. C.32; if none does, the other numbers are of the one with most evidence.
         each: whether the poses of single views are corrected beside those of the others, and not only all alike.
         sharpness: (V,) gradient of the texture relative to the other views; 1 = typical, 0 = not compared, as all that are held.
         agreement: (V,) correlation of features with the mean of the other views, after registration; 0 = not compared.
@@ -108,6 +112,7 @@ class Registration:
     edge_error: float
     rows: int
     evidence: float
+    needed: float
     accepted: bool
     each: bool
     sharpness: np.ndarray
@@ -205,27 +210,30 @@ def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = T
     judged = rows.take(rows.held_out), [world[h & own] for world, h, own in zip(edges, held, moving, strict=True)]
     maps = [_Maps.of(f, BLURS[-1]) for f in features]
 
-    # -------- Gauss-Newton: all cameras alike, then each beside the others, less and less tightly, then free --------
+    # -------- Gauss-Newton: all cameras alike, then each beside the others, less and less tightly, then each freely --------
     few = fit.take(fit.point % SHARED_EVERY == 0), [world[::SHARED_EVERY] for world in seen]
-    stages = [(BLURS, few, together(len(photos), poses, intrinsics), SURE_ALIKE)]
+    stages = [(BLURS, few, together(len(photos), poses, intrinsics), SURE_ALIKE, SURE_ALIKE)]
     if poses:
-        stages += [(BLURS[1:], (fit, seen), apart(moving, width), SURE) for width in WIDTHS]
-        # Only this one comes from so far away that a wide blur is needed.
-        stages += [(BLURS, (fit, seen), free(len(photos), intrinsics), SURE)]
-    final, own = start, False
-    for blurs, data, unknowns, sure in stages:
+        stages += [(BLURS[1:], (fit, seen), apart(moving, width), SURE, BETTER) for width in WIDTHS]
+        # Free views come from so far away that a wide blur is needed; they bring back the mean motion, which takes more evidence.
+        stages += [(BLURS, (fit, seen), free(len(photos), intrinsics), SURE, SURE)]
+    alike = final = shown = start  # what all share, with single views moved, and what the numbers are of
+    evidence, needed = 0.0, SURE_ALIKE
+    for number, (blurs, data, unknowns, sure, better) in enumerate(stages):
         state = _descend(photos, features, blurs, final, *data, unknowns)
-        # Surely better than the given cameras and than what all share; between corrections of single views less decides.
-        limits = [(final, BETTER if own else sure)] + [(start, sure)] * (final is not start)
-        if all(_compare(photos, maps, (earlier, state), *judged).pays(limit) for earlier, limit in limits):
-            final, own = state, unknowns is not stages[0][2]
-    state = state if final is start else final
-    found = _compare(photos, maps, (start, state), *judged)
+        against = _compare(photos, maps, (alike, state), *judged)
+        # Single views must surely beat what all share, and what was accepted of them.
+        pays = against.pays(sure) and (final is alike or _compare(photos, maps, (final, state), *judged).pays(better))
+        if pays:
+            final, alike = state, alike if number else state
+        if pays or (final is start and (shown is start or against.evidence / sure > evidence / needed)):
+            shown, evidence, needed = state, against.evidence, sure
+    found = _compare(photos, maps, (start, shown), *judged)
     return Registration(
-        state.pose,
-        state.principal,
-        state.focal,
-        np.array([_motion(photos, start, state, v) for v in range(len(photos))]),
+        shown.pose,
+        shown.principal,
+        shown.focal,
+        np.array([_motion(photos, start, shown, v) for v in range(len(photos))]),
         found.spread,
         found.texture.mean,
         found.texture.error,
@@ -233,14 +241,12 @@ def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = T
         found.edge.mean,
         found.edge.error,
         len(rows.view),
-        found.evidence,
+        evidence,
+        needed,
         final is not start,
-        own,
+        final is not alike,
         *_quality(photos, maps, final, rows),
     )
-
-
-_PRIOR = np.repeat([SIGMA_ROTATION, SIGMA_TRANSLATION], 3), np.array([SIGMA_PRINCIPAL, SIGMA_PRINCIPAL, SIGMA_FOCAL])
 
 
 @dataclass(frozen=True)
@@ -249,7 +255,7 @@ class Unknowns:
 
     Attributes:
         directions: (6 V + 3, n) orthogonal columns: twists of the views, principal point, log focal length.
-        sigma: (n,) standard deviation of the prior of the motion along each.
+        sigma: (n,) standard deviation of the prior of the coordinate along each.
     """
 
     directions: np.ndarray
@@ -267,7 +273,7 @@ def together(views: int, poses: bool, intrinsics: bool) -> Unknowns:
 
 def apart(moving: np.ndarray, width: float) -> Unknowns:
     """Return the unknowns with which cameras move beside each other: a twist of each, of which those that are not held have mean
-    zero, because errors of the mesh hide their mean.
+    zero in the cameras' own frames, because errors of the mesh hide their mean.
 
     Args:
         moving: (V,) bool, which views are not held; one that is held moves for itself.

@@ -461,7 +461,7 @@ def _first_step(photos: list[Photo], points: int) -> tuple[NDArray, NDArray, NDA
     features = [of.feature_image(p.image, p.usable) for p in photos]
     maps, start = [of._Maps.of(f, of.BLURS[0]) for f in features], of._Cameras.of(photos)
     edges = [of._edge_points(p) for p in photos]
-    each = of._each(len(photos), poses=True, intrinsics=True)
+    each = of.free(len(photos), intrinsics=True)
     normal, right = of.normal_equations(photos, maps, start, of._overlap(photos, features, points), edges, each)
     return normal, right, np.linalg.solve(normal, right)
 

@@ -198,7 +198,7 @@ def test_cameras_that_move_beside_each_other_have_no_mean_motion() -> None:
 
 
 def test_small_errors_of_single_views_are_corrected_beside_each_other(photos: list[Photo]) -> None:
-    """Half a pixel each: less than what free views are known to, so the narrow priors are needed."""
+    """Less than a pixel each, which is what free views are known to: the narrow priors are needed."""
     rng = np.random.default_rng(4)
     wrong = posed(photos, [twisted(p.pose, rng.normal(0, 0.005, 3), rng.normal(0, 0.003, 3)) for p in photos])
     found = register(wrong, points=4000)
@@ -258,25 +258,45 @@ def test_a_correction_pays_that_is_surely_better_and_much_worse_in_nothing(textu
 
 
 @pytest.mark.parametrize(
-    "evidence, accepted",
+    "evidence, accepted, each, shown",
     [
-        ({(0, 1): 5.5, (1, 2): 3.5, (0, 2): 9.0}, 1),  # single views must surely be better than what all share
-        ({(0, 1): 4.5, (0, 2): 4.5}, 2),  # what all share needs more evidence than single views
-        ({(0, 2): 4.5, (2, 3): 2.5, (0, 3): 4.5}, 3),  # between corrections of single views less decides
-        ({(0, 2): 4.5, (2, 3): 1.5, (0, 3): 4.5}, 2),
-        ({(0, 2): 4.5, (2, 3): 2.5, (0, 3): 3.5}, 2),  # but each is surely better than the given cameras
-        ({(0, 5): 4.5}, 5),
-        ({}, 0),
+        ({}, 0, False, 1),
+        ({(0, 1): 4.5}, 0, False, 1),  # what all cameras share needs 5
+        ({(0, 1): 5.5}, 1, False, 1),
+        ({(0, 1): 5.5, (1, 2): 3.5, (0, 2): 9.0}, 1, False, 1),  # single views must surely be better than what all share
+        ({(0, 1): 4.5, (0, 2): 4.2}, 2, True, 2),
+        ({(0, 1): 4.5, (0, 4): 3.9}, 0, False, 4),  # the numbers are of the one that comes closest to its limit
+        ({(0, 2): 4.5, (2, 3): 2.5, (0, 3): 4.5}, 3, True, 3),  # between widths less decides
+        ({(0, 2): 4.5, (2, 3): 1.5, (0, 3): 4.5}, 2, True, 2),
+        ({(0, 2): 4.5, (2, 3): 2.5, (0, 3): 3.5}, 2, True, 2),
+        ({(0, 1): 9.0, (1, 2): 4.5, (0, 2): 9.0, (2, 3): 2.5, (0, 3): 9.0, (1, 3): 3.5}, 2, True, 2),
+        ({(0, 2): 4.5, (2, 5): 3.5, (0, 5): 9.0}, 2, True, 2),  # free views are no mere width
+        ({(0, 2): 4.5, (2, 5): 4.5, (0, 5): 4.5}, 5, True, 5),
+        ({(0, 5): 4.5}, 5, True, 5),
     ],
 )
 def test_which_correction_is_accepted(
-    photos: list[Photo], monkeypatch: pytest.MonkeyPatch, evidence: dict[tuple[int, int], float], accepted: int
+    photos: list[Photo],
+    monkeypatch: pytest.MonkeyPatch,
+    evidence: dict[tuple[int, int], float],
+    accepted: int,
+    each: bool,
+    shown: int,
 ) -> None:
     """Corrections are numbered in the order in which they are tried; `evidence` is of the second of a pair against the first."""
-    tried = iter(range(1, 9))
+    tried: list[tuple[float, float]] = []
 
-    def descend(photos: list[Photo], features: object, blurs: object, start: _Cameras, *rest: object) -> _Cameras:
-        return replace(start, focal=1.0 + 1e-6 * next(tried))
+    def descend(
+        photos: list[Photo],
+        features: object,
+        blurs: tuple[float, ...],
+        start: _Cameras,
+        rows: object,
+        edges: object,
+        way: Unknowns,
+    ) -> _Cameras:
+        tried.append((blurs[0], way.sigma[0] / SIGMA_ROTATION))
+        return replace(start, focal=1.0 + 1e-6 * len(tried))
 
     def compare(photos: list[Photo], maps: object, states: tuple[_Cameras, _Cameras], *rest: object) -> _Comparison:
         z = evidence.get(tuple(round((state.focal - 1.0) * 1e6) for state in states), 0.0)
@@ -287,8 +307,12 @@ def test_which_correction_is_accepted(
     monkeypatch.setattr(registration, "_descend", descend)
     monkeypatch.setattr(registration, "_compare", compare)
     found = register(photos, points=400)
-    assert found.accepted == (accepted > 0) and found.each == (accepted > 1)
-    assert round((found.focal - 1.0) * 1e6) == (accepted or 5)  # the last that was tried, if none is
+    assert found.accepted == (accepted > 0) and found.each == each
+    assert round((found.focal - 1.0) * 1e6) == shown
+    assert found.needed == (4.0 if shown > 1 else 5.0)
+    of = max((first for first, second in evidence if second == shown and first < 2), default=0) if accepted else 0
+    assert found.evidence == pytest.approx(evidence.get((of, shown), 0.0))
+    assert tried == [(2.5, 1.0), *((1.2, pytest.approx(width)) for width in (0.03, 0.1, 0.3)), (2.5, 1.0)]
 
 
 def test_what_is_right_is_left_alone(photos: list[Photo]) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from iif_core.camera.gains import SIGNIFICANT, Evidence
-from iif_core.camera.registration import SURE
 from workflow.decisions.record import FORCED, Decision, decision, not_probed
 
 EXPOSURE_LOG_RATIO = 0.05
@@ -17,13 +16,15 @@ RESPONSE_ERRORS = 2.0
 """Standard errors by which a larger family of responses must be better."""
 
 
-def registration(accepted: bool, each: bool, evidence: float, moved: float, left_out: int, views: int) -> Decision:
+def registration(accepted: bool, each: bool, evidence: float, needed: float, moved: float, left_out: int, views: int) -> Decision:
     """Decide about corrected poses and intrinsics (`iif_core.camera.registration`).
 
     Args:
         accepted: whether a correction was accepted.
         each: whether photographs were moved each for itself, and not all alike.
-        evidence: standard errors by which texture and edges of the mesh fit better together, on surface that the fit did not see.
+        evidence: standard errors by which texture and edges of the mesh fit better together, on surface that the fit did not see:
+            with photographs moved each for itself instead of all alike, or all alike instead of none.
+        needed: what it has to exceed.
         moved: median over the views of the shift, in pixels of the given photographs.
         left_out: number of photographs that are left out; views: number of photographs.
 
@@ -36,7 +37,7 @@ def registration(accepted: bool, each: bool, evidence: float, moved: float, left
     else:
         done = f"moving them by {moved:.1f} pixels would not pay"
     reason = f"{done}; {left_out} of {views} left out as blurred or badly posed"
-    return decision("registration", accepted, measure, evidence, SURE, reason)
+    return decision("registration", accepted, measure, evidence, needed, reason)
 
 
 def held_out(step: float, every: int, blocks: int, nearest: str) -> Decision:

@@ -13,7 +13,7 @@ from workflow.decisions import camera as decisions
 from workflow.sources.folder_scene.transforms import Frame
 
 WIDTH = 200  # pixels; photographs are reduced to at most this width before they are compared
-MAX_ROWS = 300_000  # points times views; keeps the registration of a capture within some ten seconds; four times as many find no better poses
+MAX_ROWS = 300_000  # points times views; a capture registers within some ten seconds
 MIN_SHARPNESS, MIN_AGREEMENT = 0.4, 0.2
 """Sharpness, and agreement with the other views, below which a photograph is left out."""
 MAX_SHARE_LEFT_OUT = 1 / 3
@@ -72,7 +72,7 @@ def register_frames(
             new_poses[i] = pose
             new_frames[i] = replace(frames[i], camera=_camera(frames[i], found), matrix=_matrix(pose, axes, metres))
     moved = float(np.median(found.moved[used]) * scale) if used else 0.0
-    decision = decisions.registration(found.accepted, found.each, found.evidence, moved, len(left_out), len(used))
+    decision = decisions.registration(found.accepted, found.each, found.evidence, found.needed, moved, len(left_out), len(used))
     facts, words = _facts(names, found, scale), _words(found, moved, plain)
     return Registered(new_frames, new_poses, left_out, facts, words, [decision])
 
