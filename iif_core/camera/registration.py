@@ -33,7 +33,7 @@ BLURS = (2.5, 1.2, 0.7)
 SURE, SURE_ALIKE = 4.0, 5.0
 """Standard errors of both measures together by which held-out surface must be better: with corrections of single views, and with
 what all share. The errors of the mesh, which all views share, are not in them. Of right poses, the first reach 4.3, which moves
-two rooms of fifteen by a tenth of a pixel and is allowed to, and the second 4.8, which would move them by half a pixel."""
+two rooms of sixteen by a tenth of a pixel and is allowed to, and the second 4.8, which would move them by half a pixel."""
 BETTER = 2.0
 """Standard errors by which views that move less tightly must be better than the tighter ones that were accepted."""
 WORSE = 3.0
