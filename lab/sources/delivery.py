@@ -220,8 +220,8 @@ def _means(image: Array, edge: int) -> Array:
 
 def _registered(job: Job, writer: RenderedWriter, rendered: Rendered, room: Room, out: Delivered) -> list[int]:
     """Replace the cameras by wrong ones, registered as a folder's are; return the rows of `rendered` that are left."""
+    from iif_core.camera.alignment import Photo
     from iif_core.camera.distortion import Distortion
-    from iif_core.camera.registration import Photo
     from lab.simulated.realism import POSE_ERROR, focal_factor, misplaced, stream
     from workflow.sources.folder import MIN_COVERAGE
     from workflow.sources.folder_scene import images, registration

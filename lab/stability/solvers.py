@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from iif_core.camera.registration import Photo
+    from iif_core.camera.alignment import Photo
 
 EPS = float(np.finfo(np.float64).eps)
 SINGLE = float(np.finfo(np.float32).eps)
@@ -456,20 +456,20 @@ def registration() -> Iterator[Solved]:
 
 def _first_step(photos: list[Photo], points: int) -> tuple[NDArray, NDArray, NDArray]:
     """Return the normal equations of the first step of `register`, (6 V + 3, 6 V + 3) and (6 V + 3,), and its solution."""
-    from iif_core.camera import registration as of
+    from iif_core.camera import alignment as of
 
     features = [of.feature_image(p.image, p.usable) for p in photos]
-    maps, start = [of._Maps.of(f, of.BLURS[0]) for f in features], of._Cameras.of(photos)
-    edges = [of._edge_points(p) for p in photos]
+    maps, start = [of.Maps.of(f, of.BLURS[0]) for f in features], of.Cameras.of(photos)
+    edges = [of.edge_points(p) for p in photos]
     each = of.free(len(photos), intrinsics=True)
-    normal, right = of.normal_equations(photos, maps, start, of._overlap(photos, features, points), edges, each)
+    normal, right = of.normal_equations(photos, maps, start, of.overlap(photos, features, points), edges, each)
     return normal, right, np.linalg.solve(normal, right)
 
 
 def _floor_photo(paint: Callable[[NDArray, NDArray], NDArray], turn: float, light: float, metres: float) -> Photo:
     """A camera 1.5 m above the floor that looks down at an angle; `metres`: of a unit."""
+    from iif_core.camera.alignment import Photo
     from iif_core.camera.pinhole import look_at, pixel_directions
-    from iif_core.camera.registration import Photo
 
     width, height, focal = 96, 72, 80.0
     eye = np.array([np.cos(turn), np.sin(turn), 1.5])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from iif_core.camera.registration import Photo
+from iif_core.camera.alignment import Photo
 
 BOXES = (((-2.0, -2.0, -1.2), (2.0, 2.0, 1.2)), ((-0.5, -0.3, -1.2), (0.4, 0.4, -0.1)))
 WIDTH, HEIGHT, FOCAL = 128, 96, 100.0

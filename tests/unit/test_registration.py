@@ -10,30 +10,25 @@ from scipy import stats
 from scipy.ndimage import uniform_filter1d
 
 from iif_core.camera import registration
-from iif_core.camera.registration import (
-    MIN_VIEWS,
+from iif_core.camera.alignment import (
     SIGMA_ROTATION,
     SIGMA_TRANSLATION,
-    SURE,
-    Gain,
+    Cameras,
+    Maps,
     Photo,
     Unknowns,
-    _camera_points,
-    _Cameras,
-    _Comparison,
-    _edge_points,
-    _Maps,
-    _overlap,
-    _project,
     apart,
-    combined,
+    camera_points,
+    edge_points,
     feature_image,
     free,
     mesh_edges,
     normal_equations,
-    register,
+    overlap,
+    project,
     together,
 )
+from iif_core.camera.registration import MIN_VIEWS, SURE, Gain, _Comparison, combined, register
 from tests.errors import refused
 from tests.unit.painted_room import FOCAL, look, off, posed, room, twisted
 
@@ -123,9 +118,9 @@ def test_five_photographs_are_too_few_to_judge(turned: list[Photo]) -> None:
 def test_equations_along_directions_are_those_of_the_views(turned: list[Photo], unknowns: Unknowns) -> None:
     """Along directions D of no held-out view, the equations are D^T N D and D^T r with the prior of the directions."""
     views, features = len(turned), [feature_image(p.image, p.usable) for p in turned]
-    state = _Cameras.of(turned).moved(np.r_[np.tile([0.004, -0.002, 0.001, 0.003, 0.001, -0.002], views), 0.001, 0.002, 0.003])
-    maps, rows = [_Maps.of(f, 1.2) for f in features], _overlap(turned, features, 2000)
-    edges, each = [_edge_points(p) for p in turned], free(views, True)
+    state = Cameras.of(turned).moved(np.r_[np.tile([0.004, -0.002, 0.001, 0.003, 0.001, -0.002], views), 0.001, 0.002, 0.003])
+    maps, rows = [Maps.of(f, 1.2) for f in features], overlap(turned, features, 2000)
+    edges, each = [edge_points(p) for p in turned], free(views, True)
     own, right = normal_equations(turned, maps, state, rows, edges, each)
     found, sums = normal_equations(turned, maps, state, rows, edges, unknowns)
     weight = max(len(rows.view) / views / 200.0, 1.0)
@@ -142,16 +137,15 @@ def test_a_step_is_that_of_least_squares_over_cameras_and_levels(turned: list[Ph
     """With the level of every point as an unknown beside the cameras, a dense solver finds the same equations."""
     views, features = len(turned), [feature_image(p.image, p.usable) for p in turned]
     kept = [replace(p, held=k == 3) for k, p in enumerate(turned)]
-    maps, rows = [_Maps.of(f, 1.2) for f in features], _overlap(kept, features, 300)
-    state, unknowns, none = _Cameras.of(kept), free(views, True), [np.zeros((0, 3))] * views
+    maps, rows = [Maps.of(f, 1.2) for f in features], overlap(kept, features, 300)
+    state, unknowns, none = Cameras.of(kept), free(views, True), [np.zeros((0, 3))] * views
     found, right = normal_equations(kept, maps, state, rows, none, unknowns)
 
     def at(name: str, step: np.ndarray) -> np.ndarray:
         """Image coordinates, or a map there, of each (point, view)."""
         moved = state.moved(step)
         places = [
-            _project(kept[v], moved, _camera_points(moved, v, world[None]))
-            for v, world in zip(rows.view, rows.world, strict=True)
+            project(kept[v], moved, camera_points(moved, v, world[None])) for v, world in zip(rows.view, rows.world, strict=True)
         ]
         if name == "uv":
             return np.concatenate(places)
@@ -290,21 +284,21 @@ def test_which_correction_is_accepted(
         photos: list[Photo],
         features: object,
         blurs: tuple[float, ...],
-        start: _Cameras,
+        start: Cameras,
         rows: object,
         edges: object,
         way: Unknowns,
-    ) -> _Cameras:
+    ) -> Cameras:
         tried.append((blurs[0], way.sigma[0] / SIGMA_ROTATION))
         return replace(start, focal=1.0 + 1e-6 * len(tried))
 
-    def compare(photos: list[Photo], maps: object, states: tuple[_Cameras, _Cameras], *rest: object) -> _Comparison:
+    def compare(photos: list[Photo], maps: object, states: tuple[Cameras, Cameras], *rest: object) -> _Comparison:
         z = evidence.get(tuple(round((state.focal - 1.0) * 1e6) for state in states), 0.0)
         return _Comparison(
             (1.0, 1.0), Gain(0.1 * z, 0.1, np.full(100, 0.01), 1000), (0.0, 0.0), Gain(0.0, np.inf, np.zeros(100), 0)
         )
 
-    monkeypatch.setattr(registration, "_descend", descend)
+    monkeypatch.setattr(registration, "descend", descend)
     monkeypatch.setattr(registration, "_compare", compare)
     found = register(photos, points=400)
     assert found.accepted == (accepted > 0) and found.each == each

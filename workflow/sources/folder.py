@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.camera.registration import Photo
+from iif_core.camera.alignment import Photo
 from iif_core.errors import InputError
 from workflow.decisions import camera as camera_decisions
 from workflow.decisions.record import Decision

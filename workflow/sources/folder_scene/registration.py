@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.camera.registration import MIN_VIEWS, Photo, Registration, register
+from iif_core.camera.alignment import Photo
+from iif_core.camera.registration import MIN_VIEWS, Registration, register
 from workflow.decisions import camera as decisions
 from workflow.sources.folder_scene.transforms import Frame
 
