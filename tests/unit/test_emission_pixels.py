@@ -80,6 +80,10 @@ def test_both_ends_of_a_pane_outweigh_the_rows_of_its_own_group():
     pixels = of_one_object(y, group, coverage)
     transport = TracedTransport(np.broadcast_to(light.astype(np.float32), (2, 1, n, n_groups, 3)), np.zeros((2, 1, n, 3)))
     found = assemble(pixels, transport, n_groups)
+    # Groups that no anchor looks at divide nothing, however much they light.
+    with np.errstate(over="raise", divide="raise"):
+        bright = TracedTransport(1e5 * transport.matrix, transport.cached)
+        assert np.isfinite(assemble(pixels, bright, n_groups).rows.weight).all()
     weight, matrix = found.rows.weight[found.anchor], found.rows.matrix[0, 0][found.anchor]
     upper = (matrix < 0).any((1, 2))
     assert upper.sum() == seen and (~upper).sum() == seen

@@ -237,7 +237,8 @@ def _strengthened(rows: EmissionRows, anchor: np.ndarray) -> EmissionRows:
     bounds = np.zeros(elsewhere.shape)
     np.add.at(bounds, group, weight[anchor])
     own = np.where(own > 0, own, bounds)
-    factor = np.maximum(1.0, ANCHOR_WEIGHT * elsewhere / np.maximum(own, 1e-300))
+    # A group that no anchor looks at has nothing to strengthen.
+    factor = np.maximum(1.0, np.divide(ANCHOR_WEIGHT * elsewhere, own, out=np.ones_like(own), where=own > 0))
     weight[anchor] *= factor[group]
     return replace(rows, weight=weight)
 
