@@ -5,6 +5,7 @@
 KINDS = {
     "source": {
         "builtin": ("lab.sources.builtin", "lab.settings.source:BuiltinSource"),
+        "drawn": ("lab.sources.drawn", "lab.settings.source:DrawnSource"),
         "mitsuba": ("lab.sources.mitsuba", "lab.settings.source:MitsubaSource"),
     },
     "prior": {"simulated": ("lab.simulated.prior", "lab.settings.prior:SimulatedPrior")},
@@ -50,6 +51,7 @@ COSTS = {
     "base_scores": "lab.work:base_scores",
     "common_scores": "lab.work:common_scores",
     "builtin": "lab.work:rendered",
+    "drawn": "lab.work:rendered",
     "mitsuba": "lab.work:rendered",
     "relit_truth": "lab.work:relit_truth",
     "relit_scores": "lab.work:relit_scores",

@@ -41,6 +41,7 @@ from iif_core.errors import InputError
 from iif_core.evaluation.metrics import MIRROR_ROUGHNESS
 from lab.loose import Loose, document_of
 from lab.packing import OPENGL
+from lab.rooms.lamps_found import NEAR, away, lamps_found
 from workflow.report import calibration
 from workflow.report.verdict import AMBER, GREEN, LIMITS, MEANS, RED, Evidence, Limit, judge
 from workflow.runtime import device, native
@@ -55,8 +56,6 @@ STAGES = (
     *("shading", "second_look", "affines", "render", "metrics"),
 )
 ROOMS = ("kitchen", "tiny", "sky", "sun", "lamps", "gloss", "white", "evening", "blinds", "curtains", "door", "single")
-DISTANCE = 0.1
-"""Metres from a true lamp within which surface that shines is part of it."""
 
 
 @dataclass(frozen=True)
@@ -490,7 +489,7 @@ def truth(loose: Loose, room_name: str, variant: str, moved: Array) -> dict[str,
     Returns:
         offset: how far photographs and mesh are apart, median over pixels, third quartile of the photographs, as a share of
             the width.
-        missing: share of the area of the room that the mesh lacks within `DISTANCE`.
+        missing: share of the area of the room that the mesh lacks within `NEAR`.
         albedo, albedo_scaled: root mean square error of the albedo that photographs show, weighted by pixels, without lamps and
             mirrors, as it is, and with one factor on all of it; level: geometric mean of albedo over true albedo.
         false_m2: area that is taken for a lamp and is none, m^2 of the true room; false_power: its share of the power of what was
@@ -518,18 +517,11 @@ def truth(loose: Loose, room_name: str, variant: str, moved: Array) -> dict[str,
     out = _albedo_errors(found[kept], np.asarray(albedo, np.float64)[kept], cells["coverage"][kept].astype(np.float64))
 
     surface, shines = recovered.surface, np.flatnonzero(recovered.emitter_id >= 0)
-    area = face_geometry(surface.vertices, surface.faces)[1][shines] * abs(np.linalg.det(back[:3, :3])) ** (2 / 3)
-    centres = true(surface.vertices[surface.faces[shines]].mean(1))
-    power = area * recovered.light.radiance.mean(1)[shines]
-    wrong = _away(scan.vertices, scan.faces[lit], centres, DISTANCE)
-    out |= {"false_m2": float(area[wrong].sum()), "false_power": float(power[wrong].sum() / max(power.sum(), 1e-12))}
-    own = np.flatnonzero(scan.emission.any(1))
-    strength = face_geometry(scan.vertices, scan.faces)[1][own] * scan.emission[own].mean(1)
-    unfound = _away(true(surface.vertices), surface.faces[shines], scan.vertices[scan.faces[own]].mean(1), DISTANCE)
-    out["missed_power"] = float(strength[unfound].sum() / strength.sum()) if len(own) else float("nan")
+    lamps = lamps_found(room, surface.vertices, surface.faces[shines], recovered.light.radiance.mean(1)[shines], back)
+    out |= {"false_m2": lamps.false_m2, "false_power": lamps.false_power, "missed_power": lamps.missed_power()}
     area = face_geometry(scan.vertices, scan.faces)[1]
     some = np.random.default_rng(0).choice(len(area), 4000, p=area / area.sum())
-    gone = _away(true(surface.vertices), surface.faces, scan.vertices[scan.faces[some]].mean(1), DISTANCE)
+    gone = away(true(surface.vertices), surface.faces, scan.vertices[scan.faces[some]].mean(1), NEAR)
     capture = CaptureReader(loose.open("capture"))
     return out | {"missing": float(gone.mean()), "offset": _offset(capture, room_of(room_name, variant), true)}
 
@@ -542,15 +534,6 @@ def _albedo_errors(found: Array, albedo: Array, weight: Array) -> dict[str, floa
         "albedo_scaled": float(np.sqrt(np.average(((factor * found - albedo) ** 2).mean(1), weights=weight))),
         "level": float(np.exp(np.average(ratio, weights=weight))),
     }
-
-
-def _away(vertices: Array, faces: Array, points: Array, distance: float) -> Array:
-    """Return which points (n,) are farther than a distance from all faces."""
-    from iif_core.surface.closest import closest_points
-
-    if not (len(faces) and len(points)):
-        return np.ones(len(points), bool)
-    return np.linalg.norm(closest_points(vertices, faces, points).points - points, axis=1) > distance
 
 
 def _offset(capture: CaptureReader, room: Any, true: Callable[[Array], Array]) -> float:

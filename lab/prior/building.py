@@ -48,7 +48,7 @@ class Top:
 
 @dataclass(frozen=True)
 class Hole:
-    """A window opening in a wall: from `start` to `stop` along it, from `low` to `high` above the floor, metres."""
+    """An opening in a wall, for a window or a door: `start` to `stop` along it, `low` to `high` above the floor, metres."""
 
     wall: str
     start: float
@@ -69,7 +69,7 @@ class Building:
         obstacles: (low, high) (2, 3) of what cameras must not stand in.
         taken: footprints (x0, y0, x1, y1) of furniture.
         tops: surfaces for small things.
-        holes: window openings.
+        holes: window openings; doors: openings of doors that are ajar.
         sky: (H, W, 3) radiance from outside.
     """
 
@@ -81,6 +81,7 @@ class Building:
     taken: list[tuple[float, float, float, float]] = field(default_factory=list)
     tops: list[Top] = field(default_factory=list)
     holes: list[Hole] = field(default_factory=list)
+    doors: list[Hole] = field(default_factory=list)
     sky: np.ndarray = field(default_factory=lambda: np.full((*SKY, 3), 1e-5, np.float32))
 
     def chance(self, share: float) -> bool:
@@ -125,8 +126,9 @@ class Building:
         return float(self.size[0] if wall in ("north", "south") else self.size[1])
 
     def free_of_windows(self, wall: str, start: float, stop: float) -> bool:
-        """Tell whether a stretch of a wall has no window."""
-        return all(hole.wall != wall or stop < hole.start - 0.1 or start > hole.stop + 0.1 for hole in self.holes)
+        """Tell whether a stretch of a wall has no window and no door."""
+        holes = *self.holes, *self.doors
+        return all(hole.wall != wall or stop < hole.start - 0.1 or start > hole.stop + 0.1 for hole in holes)
 
     def place(self, width: float, depth: float, at_wall: bool = False) -> Placed | None:
         """Find a free place on the floor for furniture of width x depth; None where there is none.

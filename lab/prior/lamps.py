@@ -12,7 +12,7 @@ from lab.rooms import shapes
 def light_up(building: Building) -> None:
     """Add lamps: always where no light comes from outside, at times where it does."""
     rng = building.rng
-    outside = bool(building.holes)
+    outside = bool(building.holes or building.doors)
     count = int(rng.choice([0, 1, 2, 3, 5], p=[0.35, 0.3, 0.2, 0.1, 0.05])) if outside else int(rng.integers(1, 6))
     kinds = (panel, spots, bulb, shade, strip, tube, hidden)
     for _ in range(count):

@@ -8,16 +8,17 @@ import numpy as np
 
 from lab.prior.assets import Assets
 from lab.prior.building import Building, Part
+from lab.prior.doors import build_next_room, open_door
 from lab.prior.furniture import furnish
 from lab.prior.lamps import light_up
 from lab.prior.materials import Materials
 from lab.prior.palette import Palette
 from lab.prior.shell import build_shell, light_from_outside, open_windows
 
-VERSION = 3
-"""Version of the generator, written into every room's file: 1 was the prototype, 2 had no matte surface. Raise it when rooms of a
-seed change."""
-_STREAM = 0x726F6F6D
+VERSION = 4
+"""Version of the generator, written into every room's file: 1 was the prototype, 2 had no matte surface, 3 no doors. Raise it
+when rooms of a seed change."""
+_STREAM, _DOORS = 0x726F6F6D, 0x646F6F72
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,10 @@ def build(seed: int, assets: Assets | None = None) -> Room:
     size = np.round(rng.uniform((2.4, 2.4, 2.2), (7.5, 6.0, 3.6)), 2)
     building = Building(rng, size, Palette(rng, assets))
     open_windows(building)
+    doors = np.random.default_rng([seed, _DOORS])
+    open_door(building, doors)
     build_shell(building)
+    build_next_room(building, doors)
     light_from_outside(building, assets)
     furnish(building)
     light_up(building)

@@ -45,7 +45,7 @@ def build_shell(building: Building) -> None:
     for wall in WALLS:
         face = "x" if wall in ("west", "east") else "y"
         material = same if building.chance(0.65) else building.material("wall", face)
-        hole = next((hole for hole in building.holes if hole.wall == wall), None)
+        hole = next((hole for hole in (*building.holes, *building.doors) if hole.wall == wall), None)
         if hole is None:
             _sheet(building, wall, material, face, _wall(building, wall)[:3], relief)
             if building.chance(0.2):

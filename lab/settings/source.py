@@ -24,6 +24,14 @@ class BuiltinSource(Section):
     """How often every face of its mesh is split into four. The room stays the same; a scan is finer, and costs more."""
 
 
+class DrawnSource(Section):
+    """A room that is drawn at random (lab/docs/drawn.md); nothing from outside is needed."""
+
+    kind: Literal["drawn"]
+    room: int = Field(0, ge=0)
+    """Its number."""
+
+
 class MitsubaSource(Section):
     """Any Mitsuba 3 scene; the workflow renders photographs, G-buffers and ground truth itself."""
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,6 +18,7 @@ from typing import Any, TypeVar
 from pydantic import ConfigDict, Field, ValidationError
 
 from iif_core.errors import InputError
+from lab.rooms import drawn
 from workflow.settings.derived import OWN, STUDY, VARIANT, Derived, scene_of
 from workflow.settings.explain import needed
 from workflow.settings.names import REPOSITORY, did_you_mean, scene_names
@@ -228,7 +230,17 @@ def scene_overrides(root: Path = Path(".")) -> dict[str, dict[str, Any]]:
             raise InputError(
                 f"{SCENES}: {scene}: no such scene, and no `source` here.{hint} Known scenes: {', '.join(known) or 'none'}."
             )
-    return {scene: overrides or {} for scene, overrides in document.items()}
+    return {name: settings for scene, overrides in document.items() for name, settings in _rooms(scene, overrides or {})}
+
+
+def _rooms(scene: str, overrides: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield an entry of the list of scenes, or an entry `<scene>-<number>` for each of its drawn rooms."""
+    source = overrides.get("source") or {}
+    if source.get("kind") != "drawn" or "room" in source:
+        yield scene, overrides
+        return
+    for number in range(drawn.COUNT):
+        yield f"{scene}-{number}", {**overrides, "source": {**source, "room": number}}
 
 
 def file_of_source(scene: str, root: Path = Path(".")) -> Path | None:

@@ -25,9 +25,34 @@ def test_rooms_are_closed_lit_and_finite(seed):
     names = [part.name for part in room.parts]
     assert {"floor", "ceiling", "north", "south", "west", "east"} <= set(names)
     assert room.emission().any() or ("window frame" in names and room.sky.max() > 1e-3)
-    inside = [part.shape[0] for part in room.parts if part.name not in names[:6]]
+    beyond = (*names[:6], "next room", "next lamp", "door")
+    inside = [part.shape[0] for part in room.parts if part.name not in beyond]
     low, high = np.concatenate(inside).min(0), np.concatenate(inside).max(0)
     assert (low > -0.35).all() and (high < room.size + 0.35).all()
+
+
+def test_a_door_leads_to_a_closed_lit_room(llvm):
+    """No ray leaves a room whose only opening is a door; some of them reach the lamp behind it."""
+    from iif_core.light.transport.geometry import build_geometry, trace
+
+    found = []
+    for seed in range(60):
+        room = rooms.build(seed)
+        names = [part.name for part in room.parts]
+        if "door" not in names or "window frame" in names:
+            continue
+        vertices, faces, own = room.mesh()
+        rng = np.random.default_rng(seed)
+        hole = names.index("door")
+        eyes = cameras.poses(room, 6, rng)[:, :3, 3]
+        targets = room.parts[hole].shape[0].mean(0) + rng.normal(0, 0.6, (3000, 3))
+        origin = eyes[rng.integers(len(eyes), size=len(targets))]
+        face, depth = trace(build_geometry(vertices, faces, own), origin, targets - origin)
+        assert (face >= 0).all()
+        reached = origin + depth[:, None] * (targets - origin)
+        found.append((reached < -0.3).any(1).any())
+        assert room.parts[names.index("next lamp")].radiance.all()
+    assert len(found) >= 3 and np.mean(found) > 0.5
 
 
 def test_boxes_face_outward():

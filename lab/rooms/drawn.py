@@ -1,0 +1,45 @@
+"""Rooms of the generator that makes the training rooms of the learned prior, from seeds that it never trained on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lab.rooms.room import Room
+
+PREFIX = "drawn-"
+FIRST = 700_000_000
+"""Seeds from here on are of drawn rooms, with the remainder that training keeps back (`lab/prior/shards.py`)."""
+COUNT, REPORTED = 200, 80
+"""Number of rooms of the bed, and of those, the last, that only report: nothing is chosen by them."""
+SHOTS = 48
+_STREAM = 0x73686F74
+
+
+def build(number: int) -> Room:
+    """Build a drawn room: the generator's, without pictures from files, and its cameras."""
+    from lab.prior import cameras, rooms
+    from lab.prior.shards import HELD_OUT
+
+    every, remainder = HELD_OUT
+    drawn = rooms.build(FIRST + every * number + remainder)
+    rng = np.random.default_rng([number, _STREAM])
+    poses = cameras.poses(drawn, SHOTS, rng)
+    shots = np.stack([poses[:, :3, 3], poses[:, :3, 3] + poses[:, :3, 2]], 1)
+    vertices, faces, own = drawn.mesh()
+    names = tuple(f"{part.name} {i}" for i, part in enumerate(drawn.parts))
+    scanned = {i: part.delivered for i, part in enumerate(drawn.parts) if part.delivered is not None}
+    return Room(
+        f"{PREFIX}{number}",
+        vertices,
+        faces,
+        own,
+        names,
+        drawn.materials,
+        drawn.emission()[own],
+        drawn.size,
+        drawn.obstacles,
+        shots,
+        float(rng.uniform(50, 85)),
+        drawn.sky,
+        scanned,
+    )
