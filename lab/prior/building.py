@@ -70,7 +70,7 @@ class Building:
         taken: footprints (x0, y0, x1, y1) of furniture.
         tops: surfaces for small things.
         holes: window openings; doors: openings of doors that are ajar.
-        sky: (H, W, 3) radiance from outside.
+        sky: (H, W, 3) radiance from outside; outside: `sky`, `sun`, `dusk` or `panes`.
     """
 
     rng: np.random.Generator
@@ -83,6 +83,7 @@ class Building:
     holes: list[Hole] = field(default_factory=list)
     doors: list[Hole] = field(default_factory=list)
     sky: np.ndarray = field(default_factory=lambda: np.full((*SKY, 3), 1e-5, np.float32))
+    outside: str = ""
 
     def chance(self, share: float) -> bool:
         """Draw True with a probability."""

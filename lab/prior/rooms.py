@@ -31,6 +31,7 @@ class Room:
         materials: one for each part.
         obstacles: (k, 2, 3) boxes that cameras must not stand in.
         sky: (64, 128, 3) float32 radiance from outside.
+        outside: `sky`, `sun`, `dusk` or `panes`: what is seen through windows, if there are any.
     """
 
     size: np.ndarray
@@ -38,6 +39,7 @@ class Room:
     materials: Materials
     obstacles: np.ndarray
     sky: np.ndarray
+    outside: str
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return vertices (n, 3) float32, faces (m, 3) int32 and the part (m,) int32 of each face."""
@@ -75,4 +77,4 @@ def build(seed: int, assets: Assets | None = None) -> Room:
     furnish(building)
     light_up(building)
     rows = Materials([part.material for part in building.parts], building.palette.layers)
-    return Room(size, tuple(building.parts), rows, np.array(building.obstacles).reshape(-1, 2, 3), building.sky)
+    return Room(size, tuple(building.parts), rows, np.array(building.obstacles).reshape(-1, 2, 3), building.sky, building.outside)

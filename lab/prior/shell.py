@@ -109,8 +109,14 @@ def _trim(building: Building) -> None:
     x, y, z = building.size
     if building.chance(0.5):
         high, t = building.between(0.05, 0.14), 0.015
-        strips = [((0, 0), (x, t)), ((0, y - t), (x, y)), ((0, 0), (t, y)), ((x - t, 0), (x, y))]
-        pieces = [box((*low, 0.0), (*top, high)) for low, top in strips]
+        strips = {
+            "south": ((0, 0), (x, t)),
+            "north": ((0, y - t), (x, y)),
+            "west": ((0, 0), (t, y)),
+            "east": ((x - t, 0), (x, y)),
+        }
+        free = [strips[wall] for wall in strips if all(door.wall != wall for door in building.doors)]
+        pieces = [box((*low, 0.0), (*top, high)) for low, top in free]
         building.add("skirting", building.material("wall" if building.chance(0.5) else "thing"), *pieces, obstacle=False)
     if building.chance(0.25):
         for i in range(building.rng.integers(1, 4)):
@@ -128,6 +134,7 @@ def light_from_outside(building: Building, assets: Assets) -> None:
     kinds = ["overcast", "clear", "sun", "panes", "dusk", "map"]
     kind = str(rng.choice(kinds, p=[0.17, 0.12, 0.19, 0.17, 0.08, 0.27]))
     level = float(10 ** rng.uniform(-0.5, 1.2))
+    building.outside = "panes" if kind == "panes" else "sky"
     if kind == "map" and assets.skies:
         sky = np.roll(assets.skies[rng.integers(len(assets.skies))], int(rng.integers(128)), 1)
         building.sky = np.maximum(sky * (level / max(float(np.median(sky.mean(-1))), 1e-3)), 1e-5).clip(max=3e4)
@@ -137,6 +144,7 @@ def light_from_outside(building: Building, assets: Assets) -> None:
         if kind == "dusk":
             horizon, zenith, ground = 0.1 * horizon * warm(rng, 0, 1), 0.06 * zenith, 0.05 * ground
         shines = kind == "sun" or (kind == "map" and building.chance(0.5))
+        building.outside = "sun" if shines else "dusk" if kind == "dusk" else "sky"
         sun = (building.between(8, 60), building.between(-50, 130), level * building.between(40, 400)) if shines else None
         building.sky = np.maximum(sky_of(horizon, zenith, ground, sun), 1e-5)
         if building.chance(0.5):  # trees and houses

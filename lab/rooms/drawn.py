@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from lab.rooms.room import Room
+
+if TYPE_CHECKING:
+    from lab.prior import rooms
 
 PREFIX = "drawn-"
 FIRST = 700_000_000
@@ -15,13 +20,20 @@ SHOTS = 48
 _STREAM = 0x73686F74
 
 
-def build(number: int) -> Room:
-    """Build a drawn room: the generator's, without pictures from files, and its cameras."""
-    from lab.prior import cameras, rooms
+def generated(number: int) -> rooms.Room:
+    """Return a drawn room as the generator makes it, without pictures from files."""
+    from lab.prior import rooms
     from lab.prior.shards import HELD_OUT
 
     every, remainder = HELD_OUT
-    drawn = rooms.build(FIRST + every * number + remainder)
+    return rooms.build(FIRST + every * number + remainder)
+
+
+def build(number: int) -> Room:
+    """Build a drawn room with its cameras."""
+    from lab.prior import cameras
+
+    drawn = generated(number)
     rng = np.random.default_rng([number, _STREAM])
     poses = cameras.poses(drawn, SHOTS, rng)
     shots = np.stack([poses[:, :3, 3], poses[:, :3, 3] + poses[:, :3, 2]], 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,18 +41,21 @@ class LampsFound:
         return float((self.power * self.missed)[own].sum() / total) if total > 0 else float("nan")
 
 
-def lamps_found(room: Room, vertices: Array, faces: Array, radiance: Array, back: Array | None = None) -> LampsFound:
+def lamps_found(
+    room: Room, vertices: Array, faces: Array, radiance: Array, through: Collection[int] = (), back: Array | None = None
+) -> LampsFound:
     """Compare surface that was found to shine with the lamps of a room.
 
     Args:
-        room: the truth. Light passes through what a scan shows closed, so a lamp that is found there is none that is false.
+        room: the truth.
         vertices: (n, 3) metres.
         faces: (m, 3), those that were found to shine.
         radiance: (m,) what they were found to emit, mean of the channels.
+        through: ids of objects through which light passes and which a scan shows closed: no lamp that is found there is false.
         back: (4, 4) from the found to the true room; None = it is the same.
     """
     scan = room.scan
-    lit = scan.emission.any(1) | np.isin(scan.material_id, list(room.scanned))
+    lit = scan.emission.any(1) | np.isin(scan.material_id, list(through))
     back = np.eye(4) if back is None else back
     area = face_geometry(vertices, faces)[1] * abs(np.linalg.det(back[:3, :3])) ** (2 / 3)
     found = vertices @ back[:3, :3].T + back[:3, 3]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
+import re
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, PositiveFloat, ValidationError
+from pydantic import ConfigDict, Field, PositiveFloat, ValidationError, field_validator
 
 from iif_core.errors import InputError
 from iif_core.evaluation import catalogue
@@ -99,7 +100,13 @@ class Study(of_settings.Study):
     title: str
     """Title of the table and the picture."""
     scenes: list[str] = Field(min_length=1)
-    """Names of entries in lab/config/studies/scenes.yaml."""
+    """Names of entries in lab/config/studies/scenes.yaml; `drawn-0:120` stands for drawn-0 to drawn-119."""
+
+    @field_validator("scenes")
+    @classmethod
+    def _each(cls, scenes: list[str]) -> list[str]:
+        return [scene for name in scenes for scene in _range(name)]
+
     repeats: dict[str, Annotated[list[int], Field(min_length=1)]] = {}
     """Variant -> further seeds, where one of `seeds` does not tell how much a score varies."""
     scores: Literal["base_scores", "metrics", "common_scores", "relit_scores"] = "base_scores"
@@ -133,6 +140,12 @@ class Study(of_settings.Study):
     def seeds_of(self, variant: str) -> list[int]:
         """Return the seeds of a variant, those of all variants first."""
         return list(dict.fromkeys([*self.seeds, *self.repeats.get(variant, [])]))
+
+
+def _range(name: str) -> list[str]:
+    """Return the names that a range of numbers stands for, or the one name that is none."""
+    found = re.fullmatch(r"(.+-)(\d+):(\d+)", name)
+    return [f"{found[1]}{number}" for number in range(int(found[2]), int(found[3]))] if found else [name]
 
 
 def load_study(name: str, root: Path = Path(".")) -> Study:

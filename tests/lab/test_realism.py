@@ -304,7 +304,7 @@ def test_ideal_captures_keep_their_fingerprints():
 def test_studies_take_rooms_with_truth_as_they_are(repository):
     for scene in variants.scene_overrides(repository):
         found = settings.load(f"{scene}--s0", root=repository)
-        if found.source.kind in ("builtin", "mitsuba"):
+        if found.source.kind in ("builtin", "drawn", "mitsuba"):
             assert found.capture.realism == Realism(), scene
     ideal, quiet = (settings.load(f"kitchen--realism-{name}-s0", root=repository).capture for name in ("ideal", "noise"))
     assert ideal.realism is None and not quiet.realism.noise and quiet.realism.mesh
