@@ -258,8 +258,10 @@ def _cpu(scene: str) -> float:
 
 def keep(file: Path, study: str, variant: str) -> None:
     """Write the row of every room of a study to a file, those that are unchanged as they are there."""
-    from workflow.runtime import device
+    from workflow.runtime import device, native
 
+    native.prepare()
+    native.limit_threads(1)
     device.mitsuba()
     numbers = range(drawn.COUNT - drawn.REPORTED) if study == STUDIES[0] else range(drawn.COUNT - drawn.REPORTED, drawn.COUNT)
     known = {(row["room"], row["fingerprint"]): row for row in read_rows(file)} if file.is_file() else {}
