@@ -79,8 +79,9 @@ COLUMNS = {
     "rgb_held_out": Column("re-rendered, held out, dB", 1),
     "corrected": Column("corrected, held out, dB", 1),
     "iou": Column("lamps, intersection over union", 1, 2),
-    "false_m2": Column("false lamps, m²", -1, 2),
-    "false_power": Column("false lamps, share of the power found", -1, 3, 0.02),
+    "false_m2": Column("photographed surface that is a false lamp, m²", -1, 2),
+    "false_power": Column("its share of the power found", -1, 3, 0.02),
+    "stand_in": Column("unseen surface in the place of lamps, share of the power found", 0, 3),
     "missed_seen": Column("seen lamps missed, share of their power", -1, 3, 0.03),
     "missed_unseen": Column("unseen lamps missed, share of their power", -1, 3, 0.2),
     "unseen": Column("unseen lamps, share of the true power", 0, 3),
@@ -192,16 +193,19 @@ def of_lamps(number: int, job: Any, capture: Any) -> dict[str, float]:
     through = [i for i, name in enumerate(room.names) if name.split(" ")[0] in THROUGH]
     found = lamps_found(room, surface.vertices, surface.faces[shines], recovered.light.radiance.mean(1)[shines], through)
     owner, pixels = capture.faces()["instance_id"], np.zeros(len(room.names), int)
+    shown = np.zeros(len(owner), bool)
     for view in capture.used:
         truth, face = capture.reader.exr(f"truth/{view.name}.exr"), capture.gbuffer(view)[1]
+        shown[face[face >= 0]] = True
         # Photographs are of the true camera, faces of the delivered one: where both show the same object, truth is valid.
         shows = rgb(truth, "emission").any(-1) & (truth["valid"] > 0.5) & (face >= 0)
         pixels += np.bincount(owner[face[shows]], minlength=len(pixels))
     is_seen = np.isin(found.lamp, np.flatnonzero(pixels >= SEEN))
     total = found.power.sum()
     return {
-        "false_m2": found.false_m2,
-        "false_power": found.false_power,
+        "false_m2": found.false_m2(shown[shines]),
+        "false_power": found.false_power(shown[shines]),
+        "stand_in": found.false_power(~shown[shines]),
         "missed_seen": found.missed_power(found.lamp[is_seen]),
         "missed_unseen": found.missed_power(found.lamp[~is_seen]),
         "unseen": float(found.power[~is_seen].sum() / total) if total > 0 else float("nan"),

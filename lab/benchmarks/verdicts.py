@@ -520,7 +520,7 @@ def truth(loose: Loose, room_name: str, variant: str, moved: Array) -> dict[str,
     lamps = lamps_found(
         room, surface.vertices, surface.faces[shines], recovered.light.radiance.mean(1)[shines], list(room.scanned), back
     )
-    out |= {"false_m2": lamps.false_m2, "false_power": lamps.false_power, "missed_power": lamps.missed_power()}
+    out |= {"false_m2": lamps.false_m2(), "false_power": lamps.false_power(), "missed_power": lamps.missed_power()}
     area = face_geometry(scan.vertices, scan.faces)[1]
     some = np.random.default_rng(0).choice(len(area), 4000, p=area / area.sum())
     gone = away(true(surface.vertices), surface.faces, scan.vertices[scan.faces[some]].mean(1), NEAR)

@@ -22,17 +22,29 @@ class LampsFound:
     """Result of `lamps_found`.
 
     Attributes:
-        false_m2: area that is taken for a lamp and is none, m^2.
-        false_power: its share of the power of what was found.
+        area: (m,) of the faces that were found to shine, m^2 of the true room; strength: (m,) their area times radiance.
+        false: (m,) bool, those that are no lamp.
         lamp: (L,) object ids of the true lamps; power: (L,) their area times radiance; missed: (L,) share of it that is farther
             than `NEAR` from all surface that was found to shine.
     """
 
-    false_m2: float
-    false_power: float
+    area: Array
+    strength: Array
+    false: Array
     lamp: Array
     power: Array
     missed: Array
+
+    def false_m2(self, of: Array | None = None) -> float:
+        """Return the area that is taken for a lamp and is none, of the faces of a mask (m,) alone."""
+        return float(self.area[self._wrong(of)].sum())
+
+    def false_power(self, of: Array | None = None) -> float:
+        """Return its share of the power of all that was found."""
+        return float(self.strength[self._wrong(of)].sum() / max(self.strength.sum(), 1e-12))
+
+    def _wrong(self, of: Array | None) -> Array:
+        return self.false if of is None else self.false & of
 
     def missed_power(self, of: Array | None = None) -> float:
         """Return the share of the power of the true lamps that was missed, of those with an id in `of` alone; NaN without one."""
@@ -68,7 +80,7 @@ def lamps_found(
     lamp, of = np.unique(scan.material_id[own], return_inverse=True)
     total = np.bincount(of, strength, len(lamp))
     missed = np.bincount(of, strength * unfound, len(lamp)) / np.maximum(total, 1e-30)
-    return LampsFound(float(area[wrong].sum()), float(power[wrong].sum() / max(power.sum(), 1e-12)), lamp, total, missed)
+    return LampsFound(area, power, wrong, lamp, total, missed)
 
 
 def away(vertices: Array, faces: Array, points: Array, distance: float) -> Array:
