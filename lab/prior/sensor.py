@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,14 +32,13 @@ class Photographs:
         return self.values.dtype != np.uint8
 
 
-def draw_response(rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+def draw_response(rng: np.random.Generator) -> ResponseCurve:
     """Draw a response curve: S-shaped ones that differ between channels, powers, sRGB."""
     kind = rng.random()
     if kind < 0.15:
         return ResponseCurve("srgb")
     if kind < 0.25:
-        power = 1 / float(rng.uniform(1.8, 2.6))
-        return lambda x: np.clip(x, 0, 1) ** power
+        return ResponseCurve("power", (1 / float(rng.uniform(1.8, 2.6)),) * 3, linear=True)
     about = lambda centre, width: tuple(float(v) for v in centre + rng.uniform(-width, width, 3))  # noqa: E731
     strength = tuple(float(s) for s in np.clip(about(rng.uniform(0, 0.48), 0.04), 0, 0.6))
     return ResponseCurve("random", about(rng.uniform(0.88, 1.08), 0.05), strength, about(rng.uniform(0.85, 1.1), 0.05))

@@ -30,8 +30,9 @@ def generated(number: int) -> rooms.Room:
 
 
 def build(number: int) -> Room:
-    """Build a drawn room with its cameras."""
+    """Build a drawn room with its poses and its camera."""
     from lab.prior import cameras
+    from lab.prior.sensor import draw_response
 
     drawn = generated(number)
     rng = np.random.default_rng([number, _STREAM])
@@ -54,4 +55,5 @@ def build(number: int) -> Room:
         float(rng.uniform(50, 85)),
         drawn.sky,
         scanned,
+        response=draw_response(rng),
     )

@@ -11,6 +11,7 @@ from iif_core.camera.pinhole import look_at
 from iif_core.errors import InputError
 from lab.rooms.patterns import Material, MaterialTable
 from lab.rooms.shapes import Shape, merge, quarter
+from lab.simulated.photographs import ResponseCurve
 
 EMITTER_MATERIAL = Material((0.0, 0.0, 0.0), roughness=(1.0, 0.0, 0.0))
 CAMERA_MARGIN = 0.10  # metres between a camera and the box around any piece of furniture
@@ -57,6 +58,7 @@ class Room:
         scanned: object id -> shape that the delivered mesh has in place of the object's own.
         one_object: the delivered mesh tells no objects apart.
         max_bounces: longest path of its photographs.
+        response: of the camera that photographs it; None = that of all rooms.
     """
 
     name: str
@@ -74,6 +76,7 @@ class Room:
     scanned: Mapping[int, Shape] = field(default_factory=dict)
     one_object: bool = False
     max_bounces: int = 16
+    response: ResponseCurve | None = None
 
     @property
     def scan(self) -> Scan:

@@ -74,7 +74,7 @@ class _Capture:
             radiance = np.memmap(scratch, np.float32, "w+", shape=shape)
             meters = [self._view(view, radiance[i]) for i, view in enumerate(self._counted(views))]
             rendered, surface = Rendered(views, radiance, meters), Surface(scan.vertices, scan.faces, scan.object_id)
-            found = deliver(self.job, self.writer, rendered, surface, self.scan.object_id)
+            found = deliver(self.job, self.writer, rendered, surface, self.scan.object_id, self.room.response)
             del radiance, rendered
         self._finish(views, found, scan)
 

@@ -113,6 +113,7 @@ def deliver(
     rendered: Rendered,
     surface: Surface,
     owner: Array,
+    response: ResponseCurve | None = None,
 ) -> Delivered:
     """Write photographs and cameras, and G-buffers and truth again where cameras or mesh are not the true ones.
 
@@ -123,6 +124,7 @@ def deliver(
         rendered: what the source has rendered with the true cameras.
         surface: the delivered mesh.
         owner: object of each face of the true mesh.
+        response: of the camera; None = `RESPONSE`.
     """
     from lab.simulated.photographs import response_curve
     from workflow.sources.folder_scene.exposure import SharedSurface
@@ -130,7 +132,7 @@ def deliver(
 
     capture, wanted = job.settings.capture, effects(job.settings.capture)
     encoded, estimated = capture.dynamic_range == "ldr", wanted.exposure or capture.exposure == "estimate"
-    out = Delivered(list(rendered.views), response_curve(RESPONSE) if encoded else None)
+    out = Delivered(list(rendered.views), (response or response_curve(RESPONSE)) if encoded else None)
     exposures = _photographs(job, rendered, out)
     if encoded and not estimated:
         out.views = [replace(view, exposure=float(e)) for view, e in zip(out.views, exposures, strict=True)]
