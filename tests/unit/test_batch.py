@@ -195,7 +195,7 @@ def test_a_base_may_lack_what_the_line_gives(project, tmp_path):
         ("a\t\t\ttpl\tcapture.veiws=3", ["line 2, column overrides", "capture.veiws", "views"]),
         ("a\t\t\ttpl\tcapture.views=0", ["line 2, column overrides", "capture.views", 0, 1]),
         ("a\t\t\ttpl\tcapture=3", ["line 2, column overrides", "capture", 3, "key: value"]),
-        ("a\tfoldr\tx\t\tprior.kind=retinex", ["line 2, column source", "source.kind", "'foldr'", "fipt, builtin, drawn, mitsuba"]),
+        ("a\tfoldr\tx\t\tprior.kind=retinex", ["line 2, column source", "source.kind", "'foldr'", "drawn, mitsuba"]),
         ("a\tfolder\t\t\tprior.kind=retinex", ["line 2, column path", "source.path", "config/scenes/kitchen.yaml"]),
         ("a\tfolder\tx\t\tprior.kind=retinx", ["line 2, column overrides", "prior.kind", "'retinx'", "retinex"]),
         ("a\tbuiltin\tx\ttpl\tprior.kind=simulated", ["line 2, column path", "source.path", "kind, quarterings, scene"]),
