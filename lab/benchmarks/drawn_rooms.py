@@ -26,7 +26,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import lab  # noqa: F401  for the sources of the laboratory
 from iif_core.errors import InputError
-from lab.rooms import drawn
+from lab.prior import drawn
 from workflow.artifacts import StageReader
 
 Array = np.ndarray

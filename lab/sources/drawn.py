@@ -16,7 +16,7 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 
 def capture(job: Job) -> None:
     """Draw the room, photograph it, and write the normal form with ground truth."""
-    from lab.rooms import drawn
+    from lab.prior import drawn
     from lab.sources.builtin import photograph_room
 
     photograph_room(job, drawn.build(job.settings.source.room))

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from pydantic import ConfigDict, Field, ValidationError
 
 from iif_core.errors import InputError
-from lab.rooms import drawn
+from lab.prior import drawn
 from workflow.settings.derived import OWN, STUDY, VARIANT, Derived, scene_of
 from workflow.settings.explain import needed
 from workflow.settings.names import REPOSITORY, did_you_mean, scene_names

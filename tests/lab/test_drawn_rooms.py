@@ -7,9 +7,8 @@ import pytest
 
 from iif_core.surface.triangles import face_geometry
 from lab.benchmarks import drawn_rooms
-from lab.prior import rooms
+from lab.prior import drawn, rooms
 from lab.prior.shards import is_held_out
-from lab.rooms import drawn
 from lab.rooms.lamps_found import lamps_found
 from lab.rooms.shapes import sheet
 from lab.studies.files import load_study
