@@ -101,7 +101,7 @@ def test_a_comparison_is_of_pairs_and_tells_who_is_lost():
         *("+1.00 (room 1)", "+3.00 (room 2)"),
     ]
     # Less is better, and a room without the number does not count.
-    false = by["its share of the power found"]
+    false = by["false lamps, share of the power found"]
     assert false[0] == "1" and false[-1] == false[-2] == "-0.050 (room 1)"
 
 
@@ -116,7 +116,7 @@ def test_rooms_that_went_wrong_are_counted_among_those_that_tell():
     assert table["rooms with a result"][0] == "2" and table["rooms with a result"][-1] == "1 of 4 failed"
     assert table["base, as it is, dB"] == ["2", "19.6", "19.0", "19.1", "19.3", "19.6", "19.9", "20.1", "20.2", ""]
     wrong = {name: (line[0], line[-1]) for name, line in table.items() if line[-1]}
-    assert wrong["result above base, the lesser of both, dB"] == wrong["its share of the power found"] == ("2", "1")
+    assert wrong["result above base, the lesser of both, dB"] == wrong["false lamps, share of the power found"] == ("2", "1")
     assert wrong["seen lamps missed, share of their power"] == ("1", "0") and wrong["metal found, share of it"] == ("2", "1")
 
 
