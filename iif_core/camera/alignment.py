@@ -168,11 +168,15 @@ def descend(
     """Move cameras by Gauss-Newton, from blurred to sharp images."""
     # The prior pulls each view towards where this descent starts, and the intrinsics towards the given ones.
     state = replace(start, twist=np.zeros_like(start.twist))
+    # Limits of a step in rad, m, and units of the focal length, within which an image is about linear.
+    limit = np.r_[np.tile(np.repeat([0.02, 0.03], 3), len(photos)), [0.02, 0.02, 0.02]]
     # A linear model of an image holds within its blur: wide blurs bring cameras close, narrow ones make them precise.
     for blur in blurs if len(unknowns.sigma) else ():
         maps = [Maps.of(f, blur) for f in features]
         for _ in range(STEPS_PER_BLUR):
-            state = state.moved(_step(photos, maps, state, rows, edges, unknowns))
+            normal, right = normal_equations(photos, maps, state, rows, edges, unknowns)
+            step = unknowns.directions @ np.linalg.solve(normal, right)
+            state = state.moved(np.clip(step, -limit, limit))
     return state
 
 
@@ -264,11 +268,13 @@ class Maps:
 
 
 def camera_points(state: Cameras, v: int, world: np.ndarray) -> np.ndarray:
+    """Return points (n, 3) of the world in the frame of camera v, metres."""
     pose = state.pose[v]
     return (world - pose[:3, 3]) @ pose[:3, :3]
 
 
 def project(photo: Photo, state: Cameras, local: np.ndarray) -> np.ndarray:
+    """Return pixel coordinates (n, 2) of points (n, 3) in the frame of a corrected camera."""
     z = np.maximum(local[:, 2], 1e-6)
     fx, fy = photo.focal[0] * state.focal, photo.focal[1] * state.focal
     u = photo.principal[0] + fx * (local[:, 0] / z + state.principal[0])
@@ -360,11 +366,13 @@ def _rays(photo: Photo) -> np.ndarray:
 
 
 def surface_points(photo: Photo, index: np.ndarray) -> np.ndarray:
+    """Return the points (n, 3) of the world that pixels, flat indices (n,), show on the mesh."""
     local = (_rays(photo) * photo.depth[..., None]).reshape(-1, 3)[index]
     return local @ photo.pose[:3, :3].T + photo.pose[:3, 3]
 
 
 def edge_points(photo: Photo) -> np.ndarray:
+    """Return the points (n, 3) of the world on edges of the mesh (`mesh_edges`)."""
     at, z = mesh_edges(photo.depth, photo.normal, photo.usable)
     x, y = (at[:, 0] - photo.principal[0]) / photo.focal[0], (at[:, 1] - photo.principal[1]) / photo.focal[1]
     return np.stack([x * z, y * z, z], -1) @ photo.pose[:3, :3].T + photo.pose[:3, 3]
@@ -378,6 +386,7 @@ def _level(value: np.ndarray, weight: np.ndarray, point: np.ndarray) -> np.ndarr
 def feature_values(
     photos: Sequence[Photo], maps: Sequence[Maps], state: Cameras, rows: Rows, names: Sequence[str]
 ) -> list[np.ndarray]:
+    """Return maps by name (`Maps`), each interpolated where rows (n,) are seen, (n,)."""
     out = [np.zeros(len(rows.view)) for _ in names]
     for v, (photo, m) in enumerate(zip(photos, maps, strict=True)):
         own = np.flatnonzero(rows.view == v)
@@ -392,22 +401,6 @@ def residuals(photos: Sequence[Photo], maps: Sequence[Maps], state: Cameras, row
     value = feature_values(photos, maps, state, rows, ("value",))[0]
     moving = np.array([not p.held for p in photos], np.float64)[rows.view]
     return value - _level(value, moving, rows.point)
-
-
-def _step(
-    photos: Sequence[Photo],
-    maps: Sequence[Maps],
-    state: Cameras,
-    rows: Rows,
-    edges: Sequence[np.ndarray],
-    unknowns: Unknowns,
-) -> np.ndarray:
-    """Compute one Gauss-Newton step (6 V + 3,): twists, principal point, log focal length."""
-    normal, right = normal_equations(photos, maps, state, rows, edges, unknowns)
-    step = unknowns.directions @ np.linalg.solve(normal, right)
-    # rad, m, and units of the focal length. The step takes images for linear, which holds over short distances only.
-    limit = np.r_[np.tile(np.repeat([0.02, 0.03], 3), len(photos)), [0.02, 0.02, 0.02]]
-    return np.clip(step, -limit, limit)
 
 
 def normal_equations(

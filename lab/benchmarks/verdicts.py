@@ -775,7 +775,7 @@ def _evidence_table(rows: Sequence[Mapping[str, Any]]) -> str:
 def _captures_table(every: Sequence[Mapping[str, Any]]) -> str:
     heads = [
         "capture",
-        "rooms",
+        "room",
         "geometry",
         "light",
         "materials",
@@ -786,23 +786,15 @@ def _captures_table(every: Sequence[Mapping[str, Any]]) -> str:
         "level",
         "false m²",
     ]
-    lines = ["| " + " | ".join(heads) + " |", "| --- | --- " + "| ---: " * (len(heads) - 2) + "|"]
-    for spoil in SPOILS:
-        mine = [row for row in every if row["spoil"] == spoil]
-        done = [row for row in mine if row["status"] == "done"]
-        if not mine:
-            continue
-        rooms = ", ".join(row["room"] + ("" if row["status"] == "done" else f" ({row['status']})") for row in mine)
-        lights = ["".join(row[light][0] for row in done) for light in LIGHTS]
-        of = [
-            ("offset", 100, ".1f"),
-            ("albedo", 1, ".2f"),
-            ("albedo_scaled", 1, ".2f"),
-            ("level", 1, ".2f"),
-            ("false_m2", 1, ".1f"),
-        ]
-        true = [", ".join(format(k * row["true"][name], form) for row in done) for name, k, form in of]
-        lines.append("| " + " | ".join([f"`{spoil}`", rooms, *lights, *true]) + " |")
+    lines = ["| " + " | ".join(heads) + " |", "| --- " * 6 + "| ---: " * (len(heads) - 6) + "|"]
+    of = [("offset", 100, ".1f"), ("albedo", 1, ".2f"), ("albedo_scaled", 1, ".2f"), ("level", 1, ".2f"), ("false_m2", 1, ".1f")]
+    for row in sorted(every, key=lambda row: list(SPOILS).index(row["spoil"])):
+        own = [f"`{row['spoil']}`", row["room"]]
+        if row["status"] == "done":
+            own += [row[light] for light in LIGHTS] + [format(k * row["true"][name], form) for name, k, form in of]
+        lines.append(
+            "| " + " | ".join(own if row["status"] == "done" else [*own, row["status"], *[""] * (len(heads) - 3)]) + " |"
+        )
     return "\n".join(lines) + "\n"
 
 

@@ -101,12 +101,6 @@ class Study(of_settings.Study):
     """Title of the table and the picture."""
     scenes: list[str] = Field(min_length=1)
     """Names of entries in lab/config/studies/scenes.yaml; `drawn-0:120` stands for drawn-0 to drawn-119."""
-
-    @field_validator("scenes")
-    @classmethod
-    def _each(cls, scenes: list[str]) -> list[str]:
-        return [scene for name in scenes for scene in _range(name)]
-
     repeats: dict[str, Annotated[list[int], Field(min_length=1)]] = {}
     """Variant -> further seeds, where one of `seeds` does not tell how much a score varies."""
     scores: Literal["base_scores", "metrics", "common_scores", "relit_scores"] = "base_scores"
@@ -136,6 +130,11 @@ class Study(of_settings.Study):
     plot: Plot = Plot()
     sheet: Sheet = Sheet()
     """The sheet of pictures."""
+
+    @field_validator("scenes")
+    @classmethod
+    def _each(cls, scenes: list[str]) -> list[str]:
+        return [scene for name in scenes for scene in _range(name)]
 
     def seeds_of(self, variant: str) -> list[int]:
         """Return the seeds of a variant, those of all variants first."""
