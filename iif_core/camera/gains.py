@@ -25,7 +25,6 @@ MIN_ROWS = 8
 MAX_ROWS = 40_000
 """Number of rows from which the gains of all views are estimated."""
 _VIGNETTING_SIGMA = 1.0  # standard deviation of the prior of a and b
-_CHROMA_SIGMA = 0.5  # of the log gain of a channel relative to its view, many times what cameras do
 
 
 @dataclass(frozen=True)
@@ -143,15 +142,10 @@ def estimate(rows: GainRows, n_views: int, white_balance: bool = True, vignettin
 
     # -------- unknowns: gains of the views, then a and b --------
     design = data.design(n_views, white_balance, vignetting)
-    gauge, group = data.gauge(n_views, white_balance, vignetting)
+    tied, group = data.tied(n_views, white_balance), view_groups(data.cell, data.view, n_views)
+    gauge = _means(tied, design.shape[1])
     theta, weight, scale = np.zeros(design.shape[1]), np.ones(len(data.value)), 0.0
-    # Views without rows have empty columns and stay at gain 1.
-    known = np.asarray(np.abs(design).sum(0)).ravel() > 0
-    if white_balance:
-        chroma = np.kron(np.eye(n_views), np.eye(3) - 1 / 3)  # of log gains, relative to their views
-        of_channels = known[: 3 * n_views].reshape(n_views, 3)
-        of_channels |= of_channels.any(1, keepdims=True)
-    known = np.flatnonzero(known)
+    known = np.flatnonzero(np.asarray(np.abs(design).sum(0)).ravel())  # columns of views without rows are empty
     for _ in range(rounds):
         # -------- levels of the patches eliminated: X'Q'WQX and X'Q'WQ ln y (Eq. C.26) --------
         # `mixed` sums weighted rows of X over each patch; the product below is what the mean of each patch takes away.
@@ -163,11 +157,9 @@ def estimate(rows: GainRows, n_views: int, white_balance: bool = True, vignettin
         right = np.asarray(design.T @ (weight * (data.value - level[data.cell]))).ravel()
 
         # -------- gauge and prior --------
-        # The data leave the mean of each group of views open. A projector on these means sets them to 0 and changes no ratio.
+        # The data leave the mean of the views that a channel ties open. A projector on these means sets them to 0 and changes
+        # no ratio.
         normal += gauge * max(float(np.trace(normal)) / len(theta), 1e-12)
-        # A channel that is saturated where two groups of views overlap does not tie them to each other: their chroma does.
-        if white_balance:
-            normal[: 3 * n_views, : 3 * n_views] += chroma * max(scale, 1e-3) ** 2 / _CHROMA_SIGMA**2
         if vignetting:
             normal[[-2, -1], [-2, -1]] += max(scale, 1e-3) ** 2 / _VIGNETTING_SIGMA**2  # rows count 1, not 1 / scale^2
         step = np.zeros(len(theta))
@@ -184,7 +176,7 @@ def estimate(rows: GainRows, n_views: int, white_balance: bool = True, vignettin
         if done:
             break
     gains = theta[: 3 * n_views].reshape(n_views, 3) if white_balance else np.repeat(theta[:n_views, None], 3, 1)
-    seen = group >= 0
+    gains, seen = _grey(gains, tied, group), group >= 0
     return CameraGains(np.exp(np.where(seen[:, None], gains, 0.0)), theta[-2:] if vignetting else np.zeros(2), seen, scale)
 
 
@@ -259,17 +251,56 @@ class _Entries:
 
         return coo_matrix((weight, (self.cell, np.arange(len(weight)))), (int(self.cell.max()) + 1, len(weight))).tocsr()
 
-    def gauge(self, n_views: int, white_balance: bool, vignetting: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Projector on the undetermined directions (mean of each channel over connected views), and the groups of views (V,)."""
-        group = view_groups(self.cell, self.view, n_views)
-        channels, size = (3, 3 * n_views) if white_balance else (1, n_views)
-        out = np.zeros((size + 2 * vignetting, size + 2 * vignetting))
-        for g in range(int(group.max(initial=-1)) + 1):
-            for c in range(channels):
-                own = np.flatnonzero(group == g) * channels + c
-                # Projector on the constant vector over the views of one group.
-                out[np.ix_(own, own)] = 1.0 / len(own)
-        return out, group
+    def tied(self, n_views: int, white_balance: bool) -> np.ndarray:
+        """Groups of views (V, 1), or (V, 3) with white balance, whose ratios the entries of a channel tell; -1 without entries."""
+        if not white_balance:
+            return view_groups(self.cell, self.view, n_views)[:, None]
+        out = np.full((n_views, 3), -1, np.int32)
+        for c in range(3):
+            own = self.channel == c
+            if own.any():
+                out[:, c] = view_groups(self.cell[own], self.view[own], n_views)
+        return out
+
+
+def _means(tied: np.ndarray, size: int) -> np.ndarray:
+    """Projector (size, size) on the mean of each group of each channel (V, C); unknown C v + c is channel c of view v."""
+    out, channels = np.zeros((size, size)), tied.shape[1]
+    for c in range(channels):
+        for g in range(int(tied[:, c].max(initial=-1)) + 1):
+            own = np.flatnonzero(tied[:, c] == g) * channels + c
+            out[np.ix_(own, own)] = 1.0 / len(own)
+    return out
+
+
+def _grey(gains: np.ndarray, tied: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Log gains (V, 3) where groups of a channel are moved, each as a whole, to where the views are greyest.
+
+    A channel that is saturated on all surface which two groups of views share leaves their ratio in this channel open; the
+    other channels tell it. The gains are those of least squared difference from the mean of their view, among all that the
+    rows do not tell apart and whose mean over the views of each `group` (V,) is 0 in each channel.
+    """
+    out = gains.copy()
+    if tied.shape[1] == 1:
+        return out
+    for g in range(int(group.max(initial=-1)) + 1):
+        views = np.flatnonzero(group == g)
+        # A view without entries in a channel is a group of its own there.
+        own = np.where(tied[views] < 0, -1 - np.arange(len(views))[:, None], tied[views])
+        labels = [np.unique(own[:, c], return_inverse=True)[1] for c in range(3)]
+        if not any(label.any() for label in labels):
+            continue
+        # -------- moves of the groups, which keep the mean of each channel: one column each --------
+        move = np.zeros((len(views), 3, sum(int(label.max()) + 1 for label in labels)))
+        start = 0
+        for c, label in enumerate(labels):
+            move[np.arange(len(views)), c, start + label] = 1.0
+            start += int(label.max()) + 1
+        move -= move.mean(0)
+        moved_chroma = (move - move.mean(1, keepdims=True)).reshape(-1, start)
+        chroma = out[views] - out[views].mean(1, keepdims=True)
+        out[views] -= move @ np.linalg.lstsq(moved_chroma, chroma.ravel(), rcond=1e-9)[0]
+    return out
 
 
 def _chroma(gains: CameraGains) -> float:
