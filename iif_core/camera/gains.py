@@ -252,7 +252,7 @@ class _Entries:
         return coo_matrix((weight, (self.cell, np.arange(len(weight)))), (int(self.cell.max()) + 1, len(weight))).tocsr()
 
     def tied(self, n_views: int, white_balance: bool) -> np.ndarray:
-        """Groups of views (V, 1), or (V, 3) with white balance, whose ratios the entries of a channel tell; -1 without entries."""
+        """Groups of views (V, 1), or (V, 3) with white balance, whose ratios a channel tells; -1 without entries."""
         if not white_balance:
             return view_groups(self.cell, self.view, n_views)[:, None]
         out = np.full((n_views, 3), -1, np.int32)

@@ -8,8 +8,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from iif_core.numerics.arrays import unique_rows
+from iif_core.surface.holes import close_holes
 from iif_core.surface.simplify import clean, simplify
 from iif_core.surface.triangles import face_geometry
+from workflow.settings.source import PhotographedSource
 
 Array = np.ndarray
 
@@ -100,6 +102,15 @@ def scanned(
         kind[:, :count].astype(np.int32),
         kind[:, count:].astype(np.float32),
     )
+
+
+def closed(scan: Scanned) -> Scanned:
+    """Close the holes of a scan, as the product does by default when it reads one."""
+    part = unique_rows(np.column_stack([scan.ids, scan.emission]).astype(np.float64))[1]
+    found = close_holes(scan.vertices, scan.faces, PhotographedSource.model_fields["close_holes"].default, part)
+    faces = np.concatenate([scan.faces, found.faces.astype(np.int32)])
+    ids, emission = (np.concatenate([of_face, of_face[found.beside]]) for of_face in (scan.ids, scan.emission))
+    return Scanned(scan.vertices, faces, ids, emission)
 
 
 def drawn_bend(vertices: Array, faces: Array, rng: np.random.Generator) -> Bend:

@@ -105,11 +105,11 @@ class _Capture:
         """Return the mesh as a scan of it would be."""
         from lab.rooms.room import Scan
         from lab.simulated.realism import stream
-        from lab.simulated.scanned import scanned
+        from lab.simulated.scanned import closed, scanned
 
         scan = self.scan
         ids = np.column_stack([scan.object_id, scan.material_id])
-        found = scanned(scan.vertices, scan.faces, ids, scan.emission, stream(self.job.seed, "mesh"))
+        found = closed(scanned(scan.vertices, scan.faces, ids, scan.emission, stream(self.job.seed, "mesh")))
         owner, material = found.ids.T
         return Scan(found.vertices, found.faces, owner, material, scan.names, found.emission)
 

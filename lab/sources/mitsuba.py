@@ -273,10 +273,10 @@ class _Capture:
     def _scanned(self, instance: Array, views: list[View]) -> Scanned:
         """Return the mesh as a scan of it would be."""
         from lab.simulated.realism import stream
-        from lab.simulated.scanned import scanned
+        from lab.simulated.scanned import closed, scanned
 
         rng, eyes = stream(self.job.seed, "mesh"), np.stack([view.world_from_camera[:3, 3] for view in views])
-        return scanned(self.mesh.vertices, self.mesh.faces, instance[:, None], self.mesh.emission, rng, eyes)
+        return closed(scanned(self.mesh.vertices, self.mesh.faces, instance[:, None], self.mesh.emission, rng, eyes))
 
     def _normals(self, view: View, face: Array) -> Array:
         """Return world normals towards the camera (H, W, 3), 0 where nothing is hit."""

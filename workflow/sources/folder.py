@@ -158,8 +158,8 @@ def _mesh(inputs: Inputs, source: Any, poses: Sequence[np.ndarray]) -> mesh.Mesh
     centres = np.array([pose[:3, 3] for pose in poses])
     mesh.check_size(inputs.mesh, found, getattr(source, "unit", "m"), inputs.metres, centres)
     if found.from_nodes and any(frame.ids for frame in inputs.transforms.frames):
-        return replace(found, instance=None, names=None)
-    return found
+        found = replace(found, instance=None, names=None)
+    return found.closed(source.close_holes)
 
 
 def _held_out(task: _Task, poses: Sequence[np.ndarray]) -> tuple[held_out.HeldOut, list[Decision]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.surface.axes import AS_IS, turn_of
+from iif_core.surface.holes import close_holes
 from iif_core.surface.triangles import face_geometry
 from workflow.intake import limits
 from workflow.intake.documents import check_file, reading
@@ -51,6 +52,16 @@ class Mesh:
     names: list[str] | None = None
     from_nodes: bool = False
     notes: list[str] = field(default_factory=list)
+
+    def closed(self, widest: float) -> Mesh:
+        """Close holes up to `widest` metres across; what closes one belongs to an object beside it."""
+        found = close_holes(self.vertices, self.faces, widest, self.instance)
+        if not found.holes:
+            return self
+        note = f"mesh: {found.holes} holes ({found.area:.2g} m2) up to {widest:g} m across were closed (source.close_holes)"
+        faces = np.concatenate([self.faces, found.faces.astype(self.faces.dtype)])
+        instance = None if self.instance is None else np.concatenate([self.instance, self.instance[found.beside]])
+        return replace(self, faces=faces, instance=instance, notes=[*self.notes, note])
 
     @property
     def bounds(self) -> np.ndarray:
