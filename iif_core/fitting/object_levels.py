@@ -27,9 +27,9 @@ _BASE_FACTOR, _BASE_FACTORS, _BASE_FACTOR_WIDTH = 1.4, np.geomspace(0.3, 6.0, 15
 is sought; width (of the logarithm) of its prior."""
 _LIGHT_FACTORS, _LIGHT_FACTOR, _LIGHT_FACTOR_WIDTH = np.geomspace(0.5, 4.0, 13), 1.5, 0.35
 """The same for the factor between the error that all pixels of an object share and its smooth part within the object."""
-_LIGHT_FACTOR_MEASURED = 2.2
-"""That factor in rooms of known materials, which is claimed
-where the prior states its errors."""
+_SHARED_LIGHT_ERROR = 0.12
+"""Error of the light that all pixels of an object share, as a logarithm, and that no variation within the object shows: added where
+the prior states its errors."""
 _QUARTILES = 1.349
 """Distance of the quartiles of a normal distribution, in standard deviations."""
 _MIDDLE_ALBEDO = 0.3
@@ -262,10 +262,10 @@ def compare_levels(
     share = pixels[some] / max(pixels[some].sum(), 1e-100)
     count = 1.0 / max(float((share**2).sum()), 1e-100)
     best = (-np.inf, 1.0, _LIGHT_FACTOR, np.ones(3))
-    is_learnt = base_tells_levels and stated is None
+    is_learnt, shared = base_tells_levels and stated is None, 0.0 if stated is None else _SHARED_LIGHT_ERROR
     for of_base in _BASE_FACTORS if is_learnt else (1.0,):
         for of_light in _LIGHT_FACTORS if is_learnt else (_LIGHT_FACTOR,):
-            own, light = of_base * usual[some], of_light * smooth[some]
+            own, light = of_base * usual[some], np.hypot(of_light * smooth[some], shared)
             gain, away = _mean_gain(base[some], shown[some], share, np.hypot(own, light))
             # `usual` contains the factor 1.4 already, so `of_base` is relative to it.
             log_prior = -0.5 * (np.log(of_base) / _BASE_FACTOR_WIDTH) ** 2
@@ -277,17 +277,12 @@ def compare_levels(
 
     # -------- what of each discrepancy belongs to the light (Eq. M.34, M.36) --------
     discrepancy = np.log(shown.sum(1) / (base @ gain))
-    base_error, light_error = of_base * usual, of_light * smooth
-    claimed = light_error if stated is None else _LIGHT_FACTOR_MEASURED * smooth
+    base_error, light_error = of_base * usual, np.hypot(of_light * smooth, shared)
     if not base_tells_levels:
-        found = np.ones(len(base)), _T_INTERVAL * claimed
-        return ObjectLevels(base, shown, discrepancy, claimed, base_error, gain, *found, pixels, is_divided=False)
+        found = np.ones(len(base)), _T_INTERVAL * light_error
+        return ObjectLevels(base, shown, discrepancy, light_error, base_error, gain, *found, pixels, is_divided=False)
     _, mean, deviation = _divide(discrepancy, base_error, light_error)
-    if stated is not None:
-        # A base that was predicted under light that errs as the fit's does errs with it. Where the base errs by more than the
-        # light, as in most rooms, less of their discrepancy then belongs to the light, and more of its error remains.
-        deviation = _divide(discrepancy, base_error, claimed)[2]
-    return ObjectLevels(base, shown, discrepancy, claimed, base_error, gain, np.exp(mean), deviation, pixels)
+    return ObjectLevels(base, shown, discrepancy, light_error, base_error, gain, np.exp(mean), deviation, pixels)
 
 
 def _mean_gain(base: np.ndarray, shown: np.ndarray, share: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -78,11 +78,27 @@ def test_the_same_light_twice_and_after_forgetting(closed):
 def test_a_lamp_that_nobody_sees(llvm):
     parts = {"baffle": _quad((0.5, 0.5, SIZE[2] - 0.4), (3, 0, 0), (0, 2, 0), 4), "bulb": None}
     photos, _ = photographed(Room(parts=parts, lights={"lamp": np.full(3, 50.0)}))
-    assert not seen_faces(photos)[photos.scene.object_id == photos.names.index("lamp")].any()
+    assert not seen_faces(photos, 1.0)[photos.scene.object_id == photos.names.index("lamp")].any()
     _, light = _found(photos)
     own = np.flatnonzero(light.found.groups.is_hidden)
     assert len(own) == 1 and light.hidden == 1 and "unseen lamp" in " ".join(light.notes)
     assert set(photos.scene.object_id[light.found.groups.of_face == own[0]]) == {photos.names.index("lamp")}
+
+
+@pytest.mark.parametrize("shines", [True, False])
+def test_a_lamp_that_too_few_pixels_show(llvm, shines):
+    """It is no candidate; as surface that nobody sees it may shine if what shows it is bright."""
+    photos, _ = photographed(Room(lights={"bulb": BULB} if shines else {"lamp": LAMP}))
+    bulb = photos.scene.object_id == photos.names.index("bulb")
+    shown = sum(int((photos.records[v].pixels.valid & bulb[photos.records[v].pixels.face]).sum()) for v in photos.views)
+    photos = replace(photos, options=replace(photos.options, min_observations=shown + 1))
+    look, light = _found(photos)
+    assert (look.groups.of_face[bulb] < 0).all()
+    assert seen_faces(photos, look.threshold)[bulb].any() != shines
+    assert light.hidden == shines
+    if shines:
+        (own,) = np.flatnonzero(light.found.groups.is_hidden)
+        assert (light.found.groups.of_face[bulb] == own).all()
 
 
 def test_light_through_an_open_mesh(llvm):

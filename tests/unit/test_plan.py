@@ -19,7 +19,10 @@ KEYS = {"component", "included", "status", "measure", "value", "threshold", "rea
     [
         (plan.environment("auto", 0.0, 0.0005, None), False),
         (plan.environment("auto", 0.0, 0.05, None), True),
-        (plan.environment("auto", 0.01, 0.0, 0.5), True),
+        (plan.environment("auto", 0.01, 0.02, 0.6), True),
+        (plan.environment("auto", 0.01, 0.004, 0.6), False),  # cracks
+        (plan.environment("auto", 0.002, 0.002, 20.0), True),  # a small window
+        (plan.environment("auto", 0.01, 0.004, None), True),
         (plan.environment("auto", 0.01, 0.05, 0.001), False),
         (plan.environment("on", 0.0, 0.0, None), True),
         (plan.environment("off", 0.5, 0.5, 3.0), False),
@@ -89,6 +92,7 @@ LEANS = Evidence(-15.0, 10.0, 500)
         (plan.environment("auto", 0.0, 0.0, 1.0, IN), False, SETTLED),
         (plan.environment("auto", 0.1, 0.1, 1.0, IN), True, SETTLED),
         (plan.environment("auto", 0.1, 0.1, 1.0, OUT), False, SETTLED),
+        (plan.environment("auto", 0.01, 0.004, 0.6, IN), False, SETTLED),
         (plan.environment("auto", 0.1, 0.1, 1.0, UNCLEAR), True, PROVISIONAL),
         (plan.environment("auto", 0.1, 0.1, 1.0, NOTHING), True, PROVISIONAL),
         (plan.environment("auto", 0.1, 0.1, 0.001, IN), False, SETTLED),

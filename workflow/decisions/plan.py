@@ -14,6 +14,8 @@ ESCAPE_SECONDARY = 2e-3
 """The same for rays from the surface."""
 ESCAPE_BRIGHTNESS = 0.02
 """Brightness of escaping camera rays, relative to the photographs, up to which the outside counts as black."""
+ESCAPE_LIGHT = 0.01
+"""The same, times the share of rays from surface that leave: what light from outside would have to bring."""
 CACHE_COVERAGE = 0.3
 """Share of secondary hits that must have been photographed for the radiance cache."""
 LATER = {
@@ -55,7 +57,7 @@ def environment(
             the mesh is another one now: then the shares decide, by their thresholds.
     """
     leaves = f"{escape_primary:.2%} of camera rays and {escape_secondary:.2%} of others leave the mesh"
-    dark = brightness is not None and brightness <= ESCAPE_BRIGHTNESS
+    dark = brightness is not None and (brightness <= ESCAPE_BRIGHTNESS or escape_secondary * brightness < ESCAPE_LIGHT)
     # Seen, not inferred: a small lamp that the probe's rays miss may look like light from outside.
     into = f"{leaves}, into {brightness:.1%} of the mean brightness" if dark else ""
     if evidence is None:

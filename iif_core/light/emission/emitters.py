@@ -174,7 +174,7 @@ def search_emitters(
     lit, excess, power = (of_group[offered] for of_group in (pruned.kept, pruned.excess, pruned.power))
     groups, all_groups = groups.select(np.isin(np.arange(groups.size), offered)), groups.size
     scene = photos.scene
-    every = with_hidden_surface(groups, seen_faces(photos), scene.object_id, scene.areas, hits)
+    every = with_hidden_surface(groups, seen_faces(photos, threshold), scene.object_id, scene.areas, hits)
     family = _families(photos, every, every.size)
     family[: groups.size][~lit] += 2 * scene.n_objects
     family = np.unique(family, return_inverse=True)[1]

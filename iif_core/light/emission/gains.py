@@ -13,12 +13,12 @@ from iif_core.light.emission.rows import EmissionRows, light_of
 
 PRIOR_LEVEL_ERROR = 0.35
 """Standard deviation of the logarithm of the level of the light that the mean albedo of the base texture implies."""
-SHARED_LEVEL_ERROR = 0.1
+SHARED_LEVEL_ERROR = 0.2
 """Systematic error of the logarithm of the level, common to all objects: light that geometry, cache and materials lose."""
 _COLOUR_STEPS = 4
-BASE_COLOUR_ERROR = 0.1
+BASE_COLOUR_ERROR = 0.05
 """Standard deviation of the logarithm of a channel of the mean base albedo, relative to the mean over the channels."""
-SHARED_COLOUR_ERROR = 0.02
+SHARED_COLOUR_ERROR = 0.08
 """Systematic error of the logarithm of a channel's level relative to the level of all channels. All objects share this error."""
 LARGEST_COLOUR_ERROR = 0.5
 """The logarithm of a channel of the light relative to the mean over the channels is taken to be known at least so well."""

@@ -218,13 +218,24 @@ def rays_from_surface(photos: Photographs) -> np.ndarray:
     return np.asarray(photos.tracer.meets(np.concatenate(origins), np.concatenate(directions))[0])
 
 
-def seen_faces(photos: Photographs) -> np.ndarray:
-    """Return (F,) bool: a pixel shows the face, or light passes through it, so that no lamp can hide in it."""
-    shown = photos.scene.passes > 0
+def seen_faces(photos: Photographs, threshold: float) -> np.ndarray:
+    """Return (F,) bool: a pixel shows the face, or light passes through it, so that no lamp can hide in it.
+
+    An object with too few interior pixels for a candidate counts as unseen if some pixel of it reaches `threshold` or is
+    saturated: it may be a small lamp, whose pixels are mixed with what is around it.
+    """
+    scene = photos.scene
+    shown, inside, bright = scene.passes > 0, np.zeros(scene.n_objects + 1, int), np.zeros(scene.n_objects + 1, bool)
     for view in photos.views:
         record = photos.records[view]
         shown[record.pixels.face[record.pixels.valid] if record.seen is None else record.seen] = True
-    return shown
+        pixels = record.pixels.take(np.flatnonzero(record.pixels.valid))
+        radiance, bound = photos.radiance(view, pixels.value, pixels.index)
+        inside += np.bincount(pixels.object_id[pixels.interior], minlength=len(inside))[: len(inside)]
+        bright[pixels.object_id[(radiance.max(1) >= threshold) | bound.any(1)]] = True
+    hardly = bright & (inside < photos.options.min_observations)
+    hardly[-1] = False  # surface of no object, -1
+    return shown & ~hardly[scene.object_id]
 
 
 def choose_rows(
