@@ -109,7 +109,7 @@ STAGES: dict[str, Stage] = {
         Stage(
             "emission",
             "Find the emitters and solve for their radiance.",
-            ("capture", "plan", "segmentation", "base"),
+            ("capture", "prior", "plan", "segmentation", "base"),
             ("emission", "capture.dynamic_range", "affines.response", "seed"),
             reads_raw=True,
             files=("workflow.scene.response_file",),

@@ -28,8 +28,8 @@ is sought; width (of the logarithm) of its prior."""
 _LIGHT_FACTORS, _LIGHT_FACTOR, _LIGHT_FACTOR_WIDTH = np.geomspace(0.5, 4.0, 13), 1.5, 0.35
 """The same for the factor between the error that all pixels of an object share and its smooth part within the object."""
 _SHARED_LIGHT_ERROR = 0.12
-"""Error of the light that all pixels of an object share, as a logarithm, and that no variation within the object shows: added where
-the prior states its errors."""
+"""Error of the light that all pixels of an object share, as a logarithm, and that no variation within the object shows. It is
+added where the prior states its errors."""
 _QUARTILES = 1.349
 """Distance of the quartiles of a normal distribution, in standard deviations."""
 _MIDDLE_ALBEDO = 0.3

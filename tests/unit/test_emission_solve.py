@@ -427,9 +427,9 @@ def test_light_is_raised_until_albedos_are_possible():
     h = rng.uniform(2, 20, (n, 3))  # photographed light, which determines the level: gains of 1.6
     y = 1.6 * (np.einsum("ngc,gc->nc", a, TRUE) + h)
     rows = rows_of(a, observed=y, cached=[h], weight=1 / y**2)
-    plain = _gains(rows, owner, shrinkage=1e-6, albedo=BaseAlbedo(base))
+    plain = _gains(rows, owner, shrinkage=1e-6, albedo=BaseAlbedo(base, level_error=np.inf))
     assert ((plain.gain * base).max(1)[owner] > 1).mean() > 0.2
-    raised = _gains(rows, owner, shrinkage=1e-6, albedo=BaseAlbedo(base, True))
+    raised = _gains(rows, owner, shrinkage=1e-6, albedo=BaseAlbedo(base, True, np.inf))
     assert raised.level_raised > 0.1
     brightest = (raised.gain * base).max(1)
     assert (brightest[owner] > 1).mean() <= MAX_SHARE_ABOVE_WHITE
@@ -437,12 +437,44 @@ def test_light_is_raised_until_albedos_are_possible():
     light = [_light(rows, owner, found).sum() for found in (plain, raised)]
     assert light[0] == pytest.approx(TRUE.sum(), rel=0.05) and light[1] > 1.2 * light[0]
     # Where albedos are possible as they are, nothing changes.
-    dark = _gains(rows, owner, shrinkage=1e-6, albedo=BaseAlbedo(0.3 * base, True))
+    dark = _gains(rows, owner, shrinkage=1e-6, albedo=BaseAlbedo(0.3 * base, True, np.inf))
     np.testing.assert_allclose(dark.gain, plain.gain, rtol=1e-12)
     assert dark.level_raised == 0
     # Nor where no level makes them possible: photographed light alone implies gains of 1.6, emitters give next to nothing.
     faint = rows_of(1e-3 * a, observed=1.6 * h, cached=[h], weight=1 / y**2)
-    assert _gains(faint, owner, shrinkage=1e-6, albedo=BaseAlbedo(np.full((20, 3), 0.9), True)).level_raised == 0
+    assert _gains(faint, owner, shrinkage=1e-6, albedo=BaseAlbedo(np.full((20, 3), 0.9), True, np.inf)).level_raised == 0
+
+
+@pytest.mark.parametrize("seen", [False, True])
+def test_the_level_of_the_light_is_weighed_against_that_of_the_base(seen):
+    """Albedos that come out too bright as a whole ask for more light; a lamp that is seen unsaturated is as bright as it looks."""
+    rng = np.random.default_rng(11)
+    owner = np.repeat(np.arange(12), 100)
+    base = rng.uniform(0.2, 0.6, (12, 3))
+    a = np.exp(0.3 * rng.standard_normal((1200, 1, 1))) * np.ones((1200, 1, 3))
+    h = np.ones((1200, 3)) * np.exp(0.03 * rng.standard_normal((12, 3)))[owner]
+    truth = np.full((1, 3), 2.0)
+    y = 1.5 * (np.einsum("ngc,gc->nc", a, truth) + h) * np.exp(0.02 * rng.standard_normal((1200, 3)))
+    if seen:
+        a, h, y, owner = (
+            np.concatenate(pair)
+            for pair in ((a, np.ones((4, 1, 3))), (h, np.zeros((4, 3))), (y, np.tile(truth, (4, 1))), (owner, np.full(4, -1)))
+        )
+    weight = np.where(owner[:, None] < 0, 1e4, 1.0) / y**2
+    rows = rows_of(a, observed=y, cached=[h], weight=weight)
+
+    def brightness(error):
+        found = _gains(rows, owner, rounds=60, initial=np.ones((1, 3)), albedo=BaseAlbedo(base, level_error=error))
+        return np.log(found.gain[:12]).mean(), found.level_moved
+
+    (plain, still), (wide, some), (narrow, most) = (brightness(error) for error in (np.inf, 0.35, 0.05))
+    assert still == 0.0
+    if seen:
+        np.testing.assert_allclose([wide, narrow], plain, rtol=1e-3)
+        np.testing.assert_allclose([some, most], 0.0, atol=1e-3)
+    else:
+        assert plain > wide > narrow > -0.05
+        assert 0.0 < some < most
 
 
 @pytest.mark.parametrize("contrast, least, most", [(1.0, 0.45, 0.7), (0.02, 0.05, 0.5)])
@@ -462,7 +494,7 @@ def test_colour_of_the_light_is_weighed_against_that_of_the_base(contrast, least
         gain = np.log(found.gain.mean(0))
         return gain - gain.mean(), np.array(found.colour_moved)
 
-    (plain, unmoved), (weighed, moved) = cast(None), cast(BaseAlbedo(base))
+    (plain, unmoved), (weighed, moved) = cast(None), cast(BaseAlbedo(base, level_error=np.inf))
     # The colour of the light moves against the colour of the gains, by no more than they allow.
     assert not unmoved.any() and moved @ (weighed - plain) < 0
     assert np.abs(plain).max() > 0.02
@@ -494,7 +526,7 @@ def test_colour_of_one_object_is_left_to_the_photographs():
     def gain(albedo):
         return _gains(rows, np.zeros(200, int), rounds=60, initial=np.ones((1, 3)), albedo=albedo).gain
 
-    np.testing.assert_allclose(gain(BaseAlbedo(np.full((1, 3), 0.5))), gain(None), rtol=1e-12)
+    np.testing.assert_allclose(gain(BaseAlbedo(np.full((1, 3), 0.5), level_error=np.inf)), gain(None), rtol=1e-12)
     assert np.ptp(np.log(gain(None))) > 0.1
 
 

@@ -157,6 +157,7 @@ def _write_facts(
             "solver": "direct",
             "level_error": level_error if np.isfinite(level_error) else None,
             "level_raised": level_raised,
+            "level_moved": found.gains.level_moved,
             "colour_moved": list(found.gains.colour_moved),
             "active_set": active_set,
             "escape_share": {"primary": light.look.primary, "secondary": light.look.secondary},

@@ -9,6 +9,7 @@ import numpy as np
 from iif_core.camera.calibration.choice import CalibratedResponse, candidates
 from iif_core.camera.response import response
 from iif_core.light.emission.find import FirstLook, FoundLight, find_light, look_around
+from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
 from iif_core.light.emission.options import EmissionOptions, Log
 from iif_core.light.emission.photographs import Photographs
 from iif_core.light.emission.response import calibrated
@@ -20,6 +21,7 @@ from workflow.decisions import light as decisions
 from workflow.decisions.plan import environment as from_outside
 from workflow.decisions.plan import included
 from workflow.decisions.record import SETTLED, Decision
+from workflow.fitting.inputs import prediction_errors
 from workflow.runtime import device
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_base_scene
@@ -55,7 +57,7 @@ def run(job: Job) -> None:
 
 def _photographs(job: Job, capture: CaptureReader, notes: list[str]) -> tuple[Photographs, CalibratedResponse]:
     """Return the photographs with response and gains, and how these were found."""
-    scene, setting = read_base_scene(job), job.settings.affines.response
+    scene, setting, stated = read_base_scene(job), job.settings.affines.response, prediction_errors(job)
     options = options_of(EmissionOptions, job.settings.emission, seed=job.seed)
     photos = Photographs(
         views=capture.used,
@@ -68,6 +70,7 @@ def _photographs(job: Job, capture: CaptureReader, notes: list[str]) -> tuple[Ph
         records=ViewRecords(job, capture, scene, options.pixels),
         options=options,
         log=Log(job.log.info, job.progress),
+        base_level_error=PRIOR_LEVEL_ERROR if stated is None else stated.level,
     )
     measured = None
     if not isinstance(setting, str) and not capture.is_hdr:

@@ -376,7 +376,7 @@ def reliable(gains: ObjectGains) -> np.ndarray:
 def base_albedo(photos: Photographs, sky: Sky | None) -> BaseAlbedo:
     """Mean base albedo of the objects, which no gain may bring above 1 where light comes from where no camera looks: its level is
     the least certain. In a closed room the gains of single objects are less certain than the light."""
-    return BaseAlbedo(photos.scene.object_values[:, :3], sky is not None and sky.is_unseen)
+    return BaseAlbedo(photos.scene.object_values[:, :3], sky is not None and sky.is_unseen, photos.base_level_error)
 
 
 def light_prior(

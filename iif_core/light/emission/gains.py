@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -15,13 +16,15 @@ PRIOR_LEVEL_ERROR = 0.35
 """Standard deviation of the logarithm of the level of the light that the mean albedo of the base texture implies."""
 SHARED_LEVEL_ERROR = 0.2
 """Systematic error of the logarithm of the level, common to all objects: light that geometry, cache and materials lose."""
-_COLOUR_STEPS = 4
+_STEPS = 4
 BASE_COLOUR_ERROR = 0.05
 """Standard deviation of the logarithm of a channel of the mean base albedo, relative to the mean over the channels."""
 SHARED_COLOUR_ERROR = 0.08
 """Systematic error of the logarithm of a channel's level relative to the level of all channels. All objects share this error."""
 LARGEST_COLOUR_ERROR = 0.5
 """The logarithm of a channel of the light relative to the mean over the channels is taken to be known at least so well."""
+LARGEST_LEVEL_ERROR = 0.5
+"""The same of the logarithm of the level."""
 LOG_LEVELS = np.linspace(-2.0, 2.0, 161)
 """Logarithms of the level of all light that are tried (Eq. L.38)."""
 GAIN_BOUNDS = (0.1, 10.0)
@@ -39,10 +42,12 @@ class BaseAlbedo(NamedTuple):
     Attributes:
         mean: (n_objects, 3) mean base albedo.
         is_limited: no gain brings it above 1.
+        level_error: standard deviation of the logarithm of its level.
     """
 
     mean: np.ndarray
     is_limited: bool = False
+    level_error: float = PRIOR_LEVEL_ERROR
 
 
 @dataclass(frozen=True)
@@ -73,6 +78,7 @@ class ObjectGains:
             not part of the errors.
         colour_moved: (3,) logarithm by which the light of each channel was moved from the level of least cost towards the mean
             colour of the base.
+        level_moved: the same of all channels, towards its level.
     """
 
     gain: np.ndarray
@@ -82,6 +88,7 @@ class ObjectGains:
     weight: np.ndarray
     level_raised: float = 0.0
     colour_moved: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    level_moved: float = 0.0
 
 
 def estimate_object_gains(
@@ -97,8 +104,8 @@ def estimate_object_gains(
 
     y = g_o (s A_d E + h_d) + t_o (s A_s E + h_s) (Eq. L.33) is solved alternately for E (non-negative least squares) and for
     gains, gloss and level s in closed form (Eq. L.34 to L.38). Each round makes the weights relative to what is predicted
-    (docs/method/numerics.md#weights-relative-to-noisy-rows). With `albedo`, the colour of all light is weighed
-    against the mean colour of the base (docs/method/light.md#colour-of-the-light), and if albedos are limited the level is raised
+    (docs/method/numerics.md#weights-relative-to-noisy-rows). With `albedo`, colour and level of all light are weighed
+    against those of the base (docs/method/light.md#colour-and-level-of-the-light), and if albedos are limited the level is raised
     until at most `MAX_SHARE_ABOVE_WHITE` of the rows belong to objects with an albedo above 1 (Eq. L.47).
 
     Args:
@@ -162,7 +169,8 @@ def _gains_of_asked(
 
         # -------- level, gains and gloss in closed form (Eq. L.35 to L.38) --------
         moments = of_objects.moments(used, gloss_weight, radiance)
-        level = _find_level(moments, column, albedo) if scale_is_identifiable else _Level(np.zeros(3))
+        unknown = 1.0 - _share_seen(rows, used, ~known, radiance) if albedo is not None else 1.0
+        level = _find_level(moments, column, albedo, unknown) if scale_is_identifiable else _Level(np.zeros(3))
         new, gloss_gain = moments.gains(level.log_level)
         if not scale_is_identifiable:
             # The level is the prior's, so gains do not move it: the mean of log g stays 0.
@@ -176,7 +184,8 @@ def _gains_of_asked(
     errors = float("inf"), np.full((rows.groups, 3), np.inf)
     if scale_is_identifiable:
         errors = _level_errors(of_objects, weight, gloss_weight, radiance)
-    return ObjectGains(gain, gloss_gain, *errors, weight, level.raised, tuple(np.broadcast_to(level.colour, 3).tolist()))
+    colour = tuple(np.broadcast_to(level.colour, 3).tolist())
+    return ObjectGains(gain, gloss_gain, *errors, weight, level.raised, colour, level.moved)
 
 
 def _level_errors(
@@ -201,9 +210,7 @@ def _level_errors(
         return free_error, np.full(seen.shape, free_error)
 
     # -------- chi: how much of the light on the rows comes from emitters that are seen --------
-    mean = rows.matrices.mean(0)
-    size = [float((used * rows.observed * light_of(mean, e)).sum()) for e in (free, shown)]
-    phi = float(np.clip(size[1] / max(sum(size), 1e-300), 0.0, 1.0)) if size[1] > 0 else 0.0
+    phi = _share_seen(rows, weight, anchor, radiance)
 
     # -------- e_seen: do the objects agree with what is seen of the emitters? --------
     # `log_level` is the level that the objects alone would give to all light; 0 is agreement.
@@ -217,6 +224,18 @@ def _level_errors(
     return float(np.hypot(rest, phi * seen_error)), np.where(seen, 0.0, free_error)
 
 
+def _share_seen(rows: EmissionRows, weight: np.ndarray, anchor: np.ndarray, radiance: np.ndarray) -> float:
+    """Share of the modelled light on rows that are no anchors which comes from emitters that are seen unsaturated, in [0, 1]."""
+    seen = _seen_unsaturated(rows, weight, anchor)
+    if not seen.any():
+        return 0.0
+    used, mean = np.where(anchor[:, None] | rows.lower_bound, 0.0, weight), rows.matrices.mean(0)
+    free, shown = (
+        float((used * rows.observed * light_of(mean, np.where(which, radiance, 0.0))).sum()) for which in (~seen, seen)
+    )
+    return float(np.clip(shown / max(free + shown, 1e-300), 0.0, 1.0)) if shown > 0 else 0.0
+
+
 def _seen_unsaturated(rows: EmissionRows, weight: np.ndarray, anchor: np.ndarray) -> np.ndarray:
     """(G, 3) bool: a row `anchor` (n,) shows the group itself, and is no bound."""
     shown = (rows.matrices[0][anchor] > 0) & ~rows.lower_bound[anchor][:, None] & (weight[anchor] > 0)[:, None]
@@ -224,19 +243,21 @@ def _seen_unsaturated(rows: EmissionRows, weight: np.ndarray, anchor: np.ndarray
 
 
 class _Level(NamedTuple):
-    """Logarithm of the level of each channel (3,); what of it comes from the colour of the base (3,); and by how much all
+    """Logarithm of the level of each channel (3,); what of it comes from colour (3,) and level of the base; and by how much all
     channels were raised so that albedos are at most 1."""
 
     log_level: np.ndarray
     colour: np.ndarray | float = 0.0
+    moved: float = 0.0
     raised: float = 0.0
 
 
-def _find_level(moments: _Moments, owner: np.ndarray, albedo: BaseAlbedo | None) -> _Level:
-    """Find the level of least cost, with its colour weighed against the colour of the base.
+def _find_level(moments: _Moments, owner: np.ndarray, albedo: BaseAlbedo | None, unknown: float) -> _Level:
+    """Find the level of least cost, with its colour weighed against the colour of the base, and then the whole against its level.
 
     With limited albedos, all channels of the level are then raised alike until albedos are at most 1 (Eq. L.47). They are not
-    raised at all if no level achieves that. owner (n,): object of each row, the last = anchors.
+    raised at all if no level achieves that. owner (n,): object of each row, the last = anchors; unknown: share of the modelled
+    light that comes from emitters which no row shows unsaturated, and which alone can be moved.
     """
     costs = moments.costs()
     best, objects = _lowest(costs.sum(1)), moments.objects
@@ -244,39 +265,48 @@ def _find_level(moments: _Moments, owner: np.ndarray, albedo: BaseAlbedo | None)
         return _Level(best)
     base = np.asarray(albedo.mean, np.float64)[:objects]
     rows = np.bincount(owner, minlength=objects + 1)[:objects].astype(np.float64)
-    colour = np.zeros(3)
+    colour, moved = np.zeros(3), 0.0
     if (rows @ base > 0).all():
-        colour = _colour_shift(moments, best, base, rows, moments.colour_error(costs))
+
+        def cast(log_level: np.ndarray) -> np.ndarray:
+            """(3,) logarithm by which the gains at a level change the mean base albedo."""
+            return np.log((rows @ (moments.gains(log_level)[0] * base)) / (rows @ base))
+
+        error = unknown * np.minimum(moments.colour_error(costs), LARGEST_COLOUR_ERROR)
+        colour = _weighed(lambda shift: _relative(cast(best + shift)), error, BASE_COLOUR_ERROR, _relative)
         best = best + colour
+        error = unknown * min(moments.level_error(costs), LARGEST_LEVEL_ERROR)
+        moved = float(_weighed(lambda shift: cast(best + shift).mean(), np.array(error), albedo.level_error))
+        best = best + moved
     for step in LOG_LEVELS[LOG_LEVELS >= 0.0] if albedo.is_limited else ():
         brightest = (moments.gains(best + step)[0] * base).max(1)
         if rows[brightest > 1.0].sum() <= MAX_SHARE_ABOVE_WHITE * rows.sum():
-            return _Level(best + step, colour, float(step))
-    return _Level(best, colour)
+            return _Level(best + step, colour, moved, float(step))
+    return _Level(best, colour, moved)
 
 
-def _colour_shift(moments: _Moments, level: np.ndarray, base: np.ndarray, rows: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """(3,) by which log s of each channel changes, relative to the mean over channels, if the colour of the light, of standard
-    error `error` (3,), is weighed against the mean colour of the base albedos (O, 3) of objects of so many `rows` (O,).
+def _relative(channels: np.ndarray) -> np.ndarray:
+    return channels - channels.mean()
 
-    Where part of the light is given, the colour of the albedos follows the colour of the remaining light only by a share q < 1.
-    The shift d minimises (d / error)^2 + ((c - q d) / BASE_COLOUR_ERROR)^2, where c is the cast of the albedos without the shift.
+
+def _weighed(
+    cast: Callable[[np.ndarray], np.ndarray],
+    error: np.ndarray,
+    base_error: float,
+    within: Callable[[np.ndarray], np.ndarray] = lambda shift: shift,
+) -> np.ndarray:
+    """Return the d that minimises (d / error)^2 + (cast(d) / base_error)^2, kept `within` what may move.
+
+    `cast` is how far the light moved by d lets albedos differ from the base. Where part of the light is given, the albedos follow
+    the rest of it only by a share q < 1: cast(d) = cast(0) - q d.
     """
-
-    def cast(shift: np.ndarray | float) -> np.ndarray:
-        """What the gains change of the mean colour."""
-        changed = np.log((rows @ (moments.gains(level + shift)[0] * base)) / (rows @ base))
-        return changed - changed.mean()
-
-    first = cast(0.0)
-    square = np.minimum(error, LARGEST_COLOUR_ERROR) ** 2
+    first = cast(np.zeros_like(error))
     shift = first
-    for _ in range(_COLOUR_STEPS):  # the share is not the same everywhere
+    for _ in range(_STEPS):  # the share is not the same everywhere
         moved = np.abs(shift) > 1e-9
         # q as a quotient of differences: by how much this shift changes the cast.
         share = np.where(moved, (first - cast(shift)) / np.where(moved, shift, 1.0), 1.0).clip(0.0, 1.0)
-        shift = share * first * square / (share**2 * square + BASE_COLOUR_ERROR**2)
-        shift = shift - shift.mean()
+        shift = within(share * first * error**2 / (share**2 * error**2 + base_error**2))
     return shift
 
 
@@ -460,9 +490,9 @@ class _Moments:
         is_inside = (at > 0).all(1) & (at < len(LOG_LEVELS) - 1).all(1)
         return np.where(is_inside, np.sqrt(SHARED_COLOUR_ERROR**2 + (n - 1) / n * (moved**2).sum(1)), np.inf)
 
-    def level_error(self) -> float:
-        """Standard error of one log s of all channels by the jackknife over objects (Eq. L.45)."""
-        costs = self.costs().sum(2)
+    def level_error(self, costs: np.ndarray | None = None) -> float:
+        """Standard error of one log s of all channels by the jackknife over objects (Eq. L.45); `costs`: as of `costs`."""
+        costs = (self.costs() if costs is None else costs).sum(2)
         has_rows = self.observed_squared[:-1].sum(1) > 0
         whole, n = costs.sum(1), int(has_rows.sum())
         if n < 2:

@@ -24,6 +24,7 @@ from iif_core.light.emission.candidates import (
     with_thin_objects,
 )
 from iif_core.light.emission.environment import SkySums, cosine_directions
+from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.options import EmissionOptions, Log
 from iif_core.light.emission.pixels import ANCHOR_PIXELS, EmissionPixels, choose_pixels, row_tile, tile_of
@@ -118,6 +119,7 @@ class Photographs:
     records: Records
     options: EmissionOptions
     log: Log
+    base_level_error: float = PRIOR_LEVEL_ERROR  # of the logarithm of the level of the base
 
     @cached_property
     def cache_pixels(self) -> tuple[VoxelPixels, np.ndarray]:
