@@ -447,7 +447,7 @@ def test_light_is_raised_until_albedos_are_possible():
 
 @pytest.mark.parametrize("seen", [False, True])
 def test_the_level_of_the_light_is_weighed_against_that_of_the_base(seen):
-    """Albedos that come out too bright as a whole ask for more light; a lamp that is seen unsaturated is as bright as it looks."""
+    """Albedos that come out too bright as a whole ask for more light; a lamp seen unsaturated is as bright as it looks."""
     rng = np.random.default_rng(11)
     owner = np.repeat(np.arange(12), 100)
     base = rng.uniform(0.2, 0.6, (12, 3))
@@ -456,10 +456,8 @@ def test_the_level_of_the_light_is_weighed_against_that_of_the_base(seen):
     truth = np.full((1, 3), 2.0)
     y = 1.5 * (np.einsum("ngc,gc->nc", a, truth) + h) * np.exp(0.02 * rng.standard_normal((1200, 3)))
     if seen:
-        a, h, y, owner = (
-            np.concatenate(pair)
-            for pair in ((a, np.ones((4, 1, 3))), (h, np.zeros((4, 3))), (y, np.tile(truth, (4, 1))), (owner, np.full(4, -1)))
-        )
+        a, h, y = (np.concatenate(pair) for pair in ((a, np.ones((4, 1, 3))), (h, np.zeros((4, 3))), (y, np.tile(truth, (4, 1)))))
+        owner = np.r_[owner, np.full(4, -1)]
     weight = np.where(owner[:, None] < 0, 1e4, 1.0) / y**2
     rows = rows_of(a, observed=y, cached=[h], weight=weight)
 
