@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iif_core.numerics.graph import component_labels
+from iif_core.surface.closest import closest_points
 from iif_core.surface.simplify import MIN_AREA
 
 SMOOTH = 0.5
 """Least cosine between the filling and the surface beside it for an edge of a hole to count as continued."""
 CONTINUED = 0.8
 """Least share, by length, of the edges around a hole that the filling continues."""
+_PASSES = 3
+_CLOSE, _INSIDE = 0.5, 0.3  # of the distance to the rim, and of the radius of the hole: where other surface counts as near
 
 
 class Closing(NamedTuple):
@@ -35,12 +38,13 @@ class Closing(NamedTuple):
 def close_holes(vertices: ArrayLike, faces: ArrayLike, widest: float, part: ArrayLike | None = None) -> Closing:
     """Find the faces that close the holes of a mesh up to a width.
 
-    A hole is closed if its filling continues the surface around it. The rim of a lamp shade, of a box without a lid and of a
-    curtain are loops of open edges too: their filling is square to the surface beside it, or folded back onto it.
+    A hole is closed if its filling continues the surface around it, and no other surface is near the filling. The rim of a lamp
+    shade, of a box without a lid and of a curtain are loops of open edges too: their filling is square to the surface beside
+    it, or folded back onto it. A basin in a counter and a lamp in a ceiling lie in the hole that is made for them.
 
     Args:
         vertices, faces: (n, 3) and (m, 3); vertices at the same place count as one.
-        widest: largest extent of a hole along any axis, in the unit of the vertices; 0 = no hole is closed.
+        widest: largest diameter of a hole, in the unit of the vertices; 0 = no hole is closed.
         part: (m,) number of the part that each face belongs to; None = all are of one.
 
     Returns:
@@ -48,9 +52,21 @@ def close_holes(vertices: ArrayLike, faces: ArrayLike, widest: float, part: Arra
     """
     vertices, faces = np.asarray(vertices, np.float64).reshape(-1, 3), np.asarray(faces, np.int64).reshape(-1, 3)
     part = np.zeros(len(faces), np.int64) if part is None else np.asarray(part)
+    found = Closing(np.zeros((0, 3), np.int64), np.zeros(0, np.int64), 0, 0.0)
+    own = np.arange(len(faces))
+    for _ in range(_PASSES if widest > 0 and len(faces) else 0):  # of holes that touch, one pass closes some
+        new = _close(vertices, np.concatenate([faces, found.faces]), widest, np.concatenate([part, part[found.beside]]))
+        if not new.holes:
+            break
+        beside = np.concatenate([own, found.beside])[new.beside]
+        both = np.concatenate([found.faces, new.faces]), np.concatenate([found.beside, beside])
+        found = Closing(*both, found.holes + new.holes, found.area + new.area)
+    return found
+
+
+def _close(vertices: NDArray, faces: NDArray, widest: float, part: NDArray) -> Closing:
+    """One pass of `close_holes`."""
     nothing = Closing(np.zeros((0, 3), np.int64), np.zeros(0, np.int64), 0, 0.0)
-    if widest <= 0 or not len(faces):
-        return nothing
 
     # -------- edges of one face only, once vertices at the same place are one --------
     places, first, place = np.unique(vertices.astype(np.float32), axis=0, return_index=True, return_inverse=True)
@@ -65,8 +81,8 @@ def close_holes(vertices: ArrayLike, faces: ArrayLike, widest: float, part: Arra
     filling = _filled(places, whole[solid], widest)
     if not len(filling):
         return nothing
-    n, size = len(places), places[filling]
-    normal = np.cross(size[:, 1] - size[:, 0], size[:, 2] - size[:, 0]).astype(np.float64)
+    n, corners = len(places), places[filling]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).astype(np.float64)
     doubled = np.linalg.norm(normal, axis=1)
     a, b, triangle = _edges(filling)
     key = np.minimum(a, b) * n + np.maximum(a, b)
@@ -83,26 +99,54 @@ def close_holes(vertices: ArrayLike, faces: ArrayLike, widest: float, part: Arra
     patch = component_labels(len(filling) + len(inner), triangle, len(filling) + edge.ravel())[: len(filling)]
     patch = np.unique(patch, return_inverse=True)[1].ravel()
     count = int(patch.max()) + 1
+    of_edge = patch[triangle]
 
-    # -------- which of them continue the surface, and do so in the allowed width --------
+    # -------- which of them continue the surface, are as small as allowed, and are not near other surface --------
     around = np.cross(*(vertices[faces[beside]][:, k] - vertices[faces[beside]][:, 0] for k in (1, 2)))
     scale = np.maximum(np.linalg.norm(around, axis=1) * doubled[triangle], 1e-300)
     cosine = agrees * (around * normal[triangle]).sum(1) / scale
     length = np.where(shared, np.linalg.norm(places[a] - places[b], axis=1), 0.0)
-    total = np.bincount(patch[triangle], length, count)
-    continued = np.bincount(patch[triangle], length * (cosine > SMOOTH), count)
-    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-    np.minimum.at(low, patch, size.min(1))
-    np.maximum.at(high, patch, size.max(1))
+    total = np.bincount(of_edge, length, count)
+    continued = np.bincount(of_edge, length * (cosine > SMOOTH), count)
+    rim = 0.5 * (places[a] + places[b])
+    share = length / np.maximum(total, 1e-300)[of_edge]
+    middle = np.stack([np.bincount(of_edge, share * rim[:, k], count) for k in range(3)], 1)
+    radius = np.zeros(count)
+    np.maximum.at(radius, patch, np.linalg.norm(corners - middle[patch][:, None], axis=2).max(1))
     area = 0.5 * np.bincount(patch, doubled, count)
-    good = (continued >= CONTINUED * total) & (area > MIN_AREA) & ((high - low).max(1) <= widest)
+    good = (continued >= CONTINUED * total) & (area > MIN_AREA) & (2.0 * radius <= widest)
+    points = np.concatenate([corners.mean(1), rim[~shared]])
+    of_point = np.concatenate([patch, of_edge[~shared]])
+    use = good[of_point]
+    on_rim = np.concatenate([places[a[shared]], rim[shared]]), np.tile(of_edge[shared], 2)
+    good[of_point[use][_near_other(vertices, faces, points[use], of_point[use], on_rim, radius)]] = False
 
     # -------- their faces, turned as the surface is; each takes after the part with the longest border --------
-    turned = np.bincount(patch[triangle], length * agrees, count) < 0
+    turned = np.bincount(of_edge, length * agrees, count) < 0
     kept = np.flatnonzero(good[patch] & (0.5 * doubled > MIN_AREA))
     new = np.where(turned[patch[kept], None], filling[kept][:, ::-1], filling[kept])
-    owner = _longest(patch[triangle][shared], part[beside[shared]], length[shared], beside[shared], count)
+    owner = _longest(of_edge[shared], part[beside[shared]], length[shared], beside[shared], count)
     return Closing(first[new], owner[patch[kept]], int(good.sum()), float(area[good].sum()))
+
+
+def _near_other(
+    vertices: NDArray, faces: NDArray, points: NDArray, patch: NDArray, rim: tuple[NDArray, NDArray], radius: NDArray
+) -> NDArray:
+    """Which points (k,) of fillings are much nearer to the mesh than to the rim of their hole; those near the rim do not tell.
+
+    patch (k,): of the points; rim: points of the rims, and the patch of each; radius: of the patches.
+    """
+    out = np.zeros(len(points), bool)
+    if not len(points):
+        return out
+    to_mesh = np.linalg.norm(closest_points(vertices, faces, points).points - points, axis=1)
+    order, by_rim = np.argsort(patch, kind="stable"), np.argsort(rim[1], kind="stable")
+    for p in np.unique(patch):
+        own = order[slice(*np.searchsorted(patch[order], (p, p + 1)))]
+        around = rim[0][by_rim[slice(*np.searchsorted(rim[1][by_rim], (p, p + 1)))]]
+        to_rim = np.sqrt(((points[own][:, None] - around) ** 2).sum(2).min(1))
+        out[own] = (to_rim > _INSIDE * radius[p]) & (to_mesh[own] < _CLOSE * to_rim)
+    return out
 
 
 def _edges(faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:

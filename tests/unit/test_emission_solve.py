@@ -11,6 +11,7 @@ from iif_core.light.emission.gains import (
     SHARED_LEVEL_ERROR,
     BaseAlbedo,
     GainOptions,
+    _weighed,
     estimate_object_gains,
 )
 from iif_core.light.emission.pruning import WhiteSurface, insignificant, prune_groups
@@ -705,3 +706,12 @@ def test_objects_without_rows_have_the_common_gain():
     assert found.gain.shape == (7, 3) and found.gloss_gain.shape == (7,)
     np.testing.assert_allclose(found.gain[[2, 3, 5, 6]], np.tile(found.gain[[2]], (4, 1)))
     assert found.gain[2].min() >= found.gain[[0, 1, 4]].min() and found.gain[2].max() <= found.gain[[0, 1, 4]].max()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 1.0])
+def test_a_shift_minimises_what_it_says(share):
+    """(d / e)^2 + ((c - q d) / p)^2, also where the cast does not follow the light at all."""
+    found = _weighed(lambda d: 0.4 - share * d, np.array(0.3), 0.2)
+    d = np.linspace(-1, 1, 200_001)
+    wanted = d[np.argmin((d / 0.3) ** 2 + ((0.4 - share * d) / 0.2) ** 2)]
+    np.testing.assert_allclose(found, wanted, atol=2e-5)

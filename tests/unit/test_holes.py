@@ -119,6 +119,48 @@ def test_what_closes_a_hole_belongs_to_the_part_around_it():
     assert (part[found.beside] == 0).all()
 
 
+def cone(degrees):
+    """A ring of 24 faces pairs around a round hole of radius 0.2, which turn down by an angle; vertices and faces."""
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    down = np.radians(degrees)
+    vertices = np.concatenate([0.2 * ring, (0.2 + 0.3 * np.cos(down)) * ring - [0, 0, 0.3 * np.sin(down)]])
+    i, j = np.arange(24), (np.arange(24) + 1) % 24
+    return vertices, np.concatenate([np.stack([i, i + 24, j + 24], 1), np.stack([i, j + 24, j], 1)])
+
+
+@pytest.mark.parametrize(("degrees", "closed"), [(20, True), (50, True), (70, False), (110, False)])
+def test_a_filling_continues_what_turns_by_less_than_sixty_degrees(degrees, closed):
+    assert close_holes(*cone(degrees), 0.5).holes == closed
+
+
+@pytest.mark.parametrize(("steep", "closed"), [(1, True), (3, True), (8, False)])
+def test_most_of_the_rim_has_to_be_continued(steep, closed):
+    """Of the 24 faces around a hole some are square to it."""
+    (flat, faces), square = cone(10), cone(90)[0]
+    outer = np.where((np.arange(24) < steep)[:, None], square[24:], flat[24:])
+    assert close_holes(np.concatenate([flat[:24], outer]), faces, 0.5).holes == closed
+
+
+@pytest.mark.parametrize("behind", [0.0, 0.01, 0.3])
+def test_an_insert_is_not_covered(behind):
+    vertices, faces = plate()
+    left = without(vertices, faces, (1.0, 1.0, 0.0), 0.2)
+    lid, more = plate(4, 0.3)
+    both = np.concatenate([vertices, lid + (0.85, 0.85, -behind)])
+    assert close_holes(both, np.concatenate([left, more + len(vertices)]), 0.5).holes == (behind > 0.1)
+
+
+def test_holes_that_touch_at_a_corner_are_all_closed():
+    vertices, faces = plate(20, 4.0)
+    middle = np.array([[1.0, 1.0], [1.4, 1.4], [1.8, 1.8]])
+    centre = vertices[faces].mean(1)[:, :2]
+    left = faces[~(np.abs(centre[:, None] - middle) < 0.2).all(2).any(1)]
+    found = close_holes(vertices, left, 0.7)
+    assert found.holes == 3
+    assert open_edges(vertices, np.concatenate([left, found.faces])) == open_edges(vertices, faces)
+
+
 @pytest.mark.parametrize("mesh", ["empty", "one face", "all alike"])
 def test_degenerate_meshes_have_no_holes(mesh):
     vertices = np.eye(3) if mesh != "all alike" else np.zeros((3, 3))

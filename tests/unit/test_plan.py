@@ -21,7 +21,7 @@ KEYS = {"component", "included", "status", "measure", "value", "threshold", "rea
         (plan.environment("auto", 0.0, 0.05, None), True),
         (plan.environment("auto", 0.01, 0.02, 0.6), True),
         (plan.environment("auto", 0.01, 0.004, 0.6), False),  # cracks
-        (plan.environment("auto", 0.002, 0.002, 20.0), True),  # a small window
+        (plan.environment("auto", 0.002, 0.0025, 3.0), True),  # a small window, saturated
         (plan.environment("auto", 0.01, 0.004, None), True),
         (plan.environment("auto", 0.01, 0.05, 0.001), False),
         (plan.environment("on", 0.0, 0.0, None), True),

@@ -15,7 +15,8 @@ ESCAPE_SECONDARY = 2e-3
 ESCAPE_BRIGHTNESS = 0.02
 """Brightness of escaping camera rays, relative to the photographs, up to which the outside counts as black."""
 ESCAPE_LIGHT = 0.01
-"""The same, times the share of rays from surface that leave: what light from outside would have to bring."""
+"""The same, times the share of rays from surface that leave, if the outside is no brighter than the photographs: what light from
+outside has to bring. A brighter one may be saturated, and its brightness a bound."""
 CACHE_COVERAGE = 0.3
 """Share of secondary hits that must have been photographed for the radiance cache."""
 LATER = {
@@ -45,7 +46,7 @@ def _weighed(component: str, setting: str, evidence: Evidence, words: tuple[str,
 def environment(
     setting: str, escape_primary: float, escape_secondary: float, brightness: float | None, evidence: Evidence | None = None
 ) -> Decision:
-    """Decide about light from outside, needed if rays leave the mesh and do not meet black.
+    """Decide about light from outside, needed if rays leave the mesh and do not meet black, or next to no light through cracks.
 
     See docs/method/light.md#when-an-environment-is-included.
 
@@ -57,7 +58,9 @@ def environment(
             the mesh is another one now: then the shares decide, by their thresholds.
     """
     leaves = f"{escape_primary:.2%} of camera rays and {escape_secondary:.2%} of others leave the mesh"
-    dark = brightness is not None and (brightness <= ESCAPE_BRIGHTNESS or escape_secondary * brightness < ESCAPE_LIGHT)
+    dark = brightness is not None and (
+        brightness <= ESCAPE_BRIGHTNESS or (brightness <= 1.0 and escape_secondary * brightness < ESCAPE_LIGHT)
+    )
     # Seen, not inferred: a small lamp that the probe's rays miss may look like light from outside.
     into = f"{leaves}, into {brightness:.1%} of the mean brightness" if dark else ""
     if evidence is None:

@@ -172,9 +172,10 @@ def search_emitters(
     # Groups were dropped one after the other; of some the light was given to others, and they may be needed after all.
     offered = np.flatnonzero(pruned.may_shine(certain, photos.options.prune)[: groups.size])
     lit, excess, power = (of_group[offered] for of_group in (pruned.kept, pruned.excess, pruned.power))
-    groups, all_groups = groups.select(np.isin(np.arange(groups.size), offered)), groups.size
-    scene = photos.scene
-    every = with_hidden_surface(groups, seen_faces(photos, threshold), scene.object_id, scene.areas, hits)
+    scene, all_groups = photos.scene, groups.size
+    known = seen_faces(photos, threshold) | (groups.of_face >= 0)  # a candidate that was left out does not come back as unseen
+    groups = groups.select(np.isin(np.arange(groups.size), offered))
+    every = with_hidden_surface(groups, known, scene.object_id, scene.areas, hits)
     family = _families(photos, every, every.size)
     family[: groups.size][~lit] += 2 * scene.n_objects
     family = np.unique(family, return_inverse=True)[1]

@@ -169,8 +169,10 @@ def _gains_of_asked(
 
         # -------- level, gains and gloss in closed form (Eq. L.35 to L.38) --------
         moments = of_objects.moments(used, gloss_weight, radiance)
-        unknown = 1.0 - _share_seen(rows, used, ~known, radiance) if albedo is not None else 1.0
-        level = _find_level(moments, column, albedo, unknown) if scale_is_identifiable else _Level(np.zeros(3))
+        level = _Level(np.zeros(3))
+        if scale_is_identifiable:
+            unknown = 1.0 if albedo is None else 1.0 - _share_seen(rows, used, ~known, radiance)
+            level = _find_level(moments, column, albedo, unknown)
         new, gloss_gain = moments.gains(level.log_level)
         if not scale_is_identifiable:
             # The level is the prior's, so gains do not move it: the mean of log g stays 0.
@@ -272,10 +274,12 @@ def _find_level(moments: _Moments, owner: np.ndarray, albedo: BaseAlbedo | None,
             """(3,) logarithm by which the gains at a level change the mean base albedo."""
             return np.log((rows @ (moments.gains(log_level)[0] * base)) / (rows @ base))
 
-        error = unknown * np.minimum(moments.colour_error(costs), LARGEST_COLOUR_ERROR)
+        # What is seen of emitters tells no error of the others.
+        free = np.concatenate([costs[:, :-1], np.zeros_like(costs[:, -1:])], 1)
+        error = unknown * np.minimum(moments.colour_error(free), LARGEST_COLOUR_ERROR)
         colour = _weighed(lambda shift: _relative(cast(best + shift)), error, BASE_COLOUR_ERROR, _relative)
         best = best + colour
-        error = unknown * min(moments.level_error(costs), LARGEST_LEVEL_ERROR)
+        error = unknown * min(moments.level_error(free), LARGEST_LEVEL_ERROR)
         moved = float(_weighed(lambda shift: cast(best + shift).mean(), np.array(error), albedo.level_error))
         best = best + moved
     for step in LOG_LEVELS[LOG_LEVELS >= 0.0] if albedo.is_limited else ():
@@ -300,12 +304,12 @@ def _weighed(
     `cast` is how far the light moved by d lets albedos differ from the base. Where part of the light is given, the albedos follow
     the rest of it only by a share q < 1: cast(d) = cast(0) - q d.
     """
-    first = cast(np.zeros_like(error))
+    first, share = cast(np.zeros_like(error)), np.ones_like(error)
     shift = first
     for _ in range(_STEPS):  # the share is not the same everywhere
         moved = np.abs(shift) > 1e-9
         # q as a quotient of differences: by how much this shift changes the cast.
-        share = np.where(moved, (first - cast(shift)) / np.where(moved, shift, 1.0), 1.0).clip(0.0, 1.0)
+        share = np.where(moved, (first - cast(shift)) / np.where(moved, shift, 1.0), share).clip(0.0, 1.0)
         shift = within(share * first * error**2 / (share**2 * error**2 + base_error**2))
     return shift
 

@@ -227,17 +227,21 @@ def seen_faces(photos: Photographs, threshold: float) -> np.ndarray:
     saturated: it may be a small lamp, whose pixels are mixed with what is around it.
     """
     scene = photos.scene
-    shown, inside, bright = scene.passes > 0, np.zeros(scene.n_objects + 1, int), np.zeros(scene.n_objects + 1, bool)
+    shown, inside, bright = (
+        np.zeros(len(scene.faces), bool),
+        np.zeros(scene.n_objects + 1, int),
+        np.zeros(scene.n_objects + 1, bool),
+    )
     for view in photos.views:
         record = photos.records[view]
         shown[record.pixels.face[record.pixels.valid] if record.seen is None else record.seen] = True
         pixels = record.pixels.take(np.flatnonzero(record.pixels.valid))
         radiance, bound = photos.radiance(view, pixels.value, pixels.index)
-        inside += np.bincount(pixels.object_id[pixels.interior], minlength=len(inside))[: len(inside)]
+        inside += np.bincount(pixels.object_id[pixels.interior], minlength=len(inside))
         bright[pixels.object_id[(radiance.max(1) >= threshold) | bound.any(1)]] = True
     hardly = bright & (inside < photos.options.min_observations)
     hardly[-1] = False  # surface of no object, -1
-    return shown & ~hardly[scene.object_id]
+    return (shown & ~hardly[scene.object_id]) | (scene.passes > 0)
 
 
 def choose_rows(
