@@ -28,7 +28,7 @@ def with_hidden_surface(
 
     Args:
         groups: of what cameras see, on F faces.
-        seen: (F,) bool, some pixel shows the face.
+        seen: (F,) bool, pixels show the face, and enough to say whether it shines.
         object_id: (F,), -1 = none.
         areas: (F,) m^2.
         hits: (F,) cosine-distributed rays from visible surface that meet each face.
