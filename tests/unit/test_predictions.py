@@ -97,7 +97,7 @@ def test_an_error_that_is_stated_is_not_learnt_again():
     shown = truth * np.exp(0.05 * rng.normal(size=60))[:, None]
     levels = compare_levels(base, shown, np.full(60, 0.02), np.full(60, 0.05), np.full(60, 100.0), stated=0.2)
     np.testing.assert_allclose(levels.base_error, 0.2 * relative_error_of_base(base.mean(1)), rtol=1e-12)
-    assert np.std(np.log(levels.light_gain)) < 0.06
+    assert np.std(np.log(levels.light_gain)) < 0.09
     assert relative_error_of_base(np.array([0.3]))[0] == 1 and np.isfinite(relative_error_of_base(np.array([0.0, 9.0]))).all()
 
 
@@ -113,11 +113,12 @@ def test_an_error_that_base_and_light_share_is_claimed_nevertheless():
         for stated, found in inside.items():
             levels = compare_levels(base, shown, np.full(40, 0.1), smooth, np.full(40, 100.0), stated=stated)
             found.append(np.abs(shared) < 1.142 * levels.light_error)  # the central 68 % of Student's t
-            if stated is not None:  # less of a discrepancy is the light's than errors that are independent would have it
-                part = object_levels._divide(levels.discrepancy, levels.base_error, 1.5 * smooth)[1]
-                left = object_levels._divide(levels.discrepancy, levels.base_error, 2.2 * smooth)[2]
+            if stated is not None:  # even light on an object may be wrong as a whole
+                light_error = np.hypot(1.5 * smooth, 0.12)
+                np.testing.assert_allclose(levels.light_error, light_error, rtol=1e-12)
+                part, deviation = object_levels._divide(levels.discrepancy, levels.base_error, light_error)[1:]
                 np.testing.assert_allclose(levels.light_gain, np.exp(part), rtol=1e-12)
-                np.testing.assert_allclose(levels.deviation, left, rtol=1e-12)
+                np.testing.assert_allclose(levels.deviation, deviation, rtol=1e-12)
     assert 0.6 < np.mean(inside[0.2]) < 0.76 and np.mean(inside[None]) < 0.5
 
 

@@ -72,7 +72,7 @@ def test_hdr_emission_is_recovered(hdr):
 def test_a_third_of_the_pixels_finds_the_same_light(hdr, tmp_path):
     """Where photographs have more pixels than the stage looks at, a part of each stands for it."""
     folder, _ = hdr
-    for stage in ("capture", "plan", "segmentation", "base"):
+    for stage in ("capture", "prior", "plan", "segmentation", "base"):
         shutil.copytree(folder / stage, tmp_path / stage)
     _run(tmp_path, "hdr", upto="emission", emission={"pixels": 6 * 48 * 48 // 3})
     table, radiance = _emitters(tmp_path)
