@@ -274,7 +274,7 @@ def _means(tied: np.ndarray, size: int) -> np.ndarray:
 
 
 def _grey(gains: np.ndarray, tied: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Log gains (V, 3) where groups of a channel are moved, each as a whole, to where the views are greyest.
+    """Return log gains (V, 3) with the groups of each channel moved, each as a whole, to where the views are greyest.
 
     A channel that is saturated on all surface which two groups of views share leaves their ratio in this channel open; the
     other channels tell it. The gains are those of least squared difference from the mean of their view, among all that the

@@ -22,7 +22,10 @@ def sphere(rings: int = 24):
         [np.outer(np.sin(theta), np.cos(phi)), np.outer(np.sin(theta), np.sin(phi)), np.outer(np.cos(theta), 0 * phi + 1)], -1
     )
     n = 2 * rings
-    at = lambda i, j: i * n + j % n  # noqa: E731
+
+    def at(i, j):
+        return i * n + j % n
+
     faces = [
         f
         for i in range(rings)
