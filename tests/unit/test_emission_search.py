@@ -147,8 +147,8 @@ def _room(strip, reflects=0.1, seed=3):
     shown = np.array([lamp, patch, 0.0, 0.0])[:, None] * np.ones(3)
     hidden = np.array([False, False, True, True])
     white = WhiteSurface(np.zeros((4, 3)), np.zeros((4, 4, 3)), np.full((4, 3), reflects))
-    base = guess[:, None] * np.ones(3)
-    return Candidates(problem.beside(anchors), reflecting, own, prior, np.arange(4), hidden, shown, white, BaseAlbedo(base), 2.0)
+    base, usual = BaseAlbedo(guess[:, None] * np.ones(3)), np.ones(4)
+    return Candidates(problem.beside(anchors), reflecting, own, prior, np.arange(4), hidden, shown, white, base, 2.0, usual)
 
 
 def _growth(candidates, *chosen, doubtful=()):
@@ -244,6 +244,38 @@ def test_unseen_surface_that_a_white_one_could_match_is_no_lamp():
 
 def test_a_room_that_is_explained_is_left_alone():
     assert _growth(_room(0.0), 0) == {}
+
+
+def test_an_unlikely_family_must_explain_more_and_a_likely_one_less():
+    """Family 2 may be added, but not if the misfit with it counts a hundredfold; family 1 may go, but not if it is likely."""
+    room = _room(1.0)
+    growth = next(value for families, value in _growth(room, 0, 1).items() if 2 in families)
+    assert growth == 1 - STEP
+    unlikely = replace(room, weights=np.array([1.0, 1.0, 100.0, 1.0]))
+    assert not any(2 in families for families in _growth(unlikely, 0, 1))
+    assert unlikely.weight(frozenset({1, 2})) == 100.0 and unlikely.weight(frozenset()) == 1.0
+    gone = frozenset({0, 2})
+    likely = replace(room, weights=np.array([1.0, 1e-3, 1.0, 1.0]))
+    assert gone in _growth(room, 0, 1, 2) and gone not in _growth(likely, 0, 1, 2)
+
+
+def test_search_compares_weighted_misfits():
+    misfit = {frozenset({0}): 1.0, frozenset({0, 1}): 0.9, frozenset({0, 2}): 0.8}.__getitem__
+    proposed = [Proposal(frozenset({0, 1})), Proposal(frozenset({0, 2}))]
+
+    def run(weights):
+        return search(
+            frozenset({0}),
+            lambda now: proposed if now == {0} else [],
+            misfit,
+            lambda families: float(np.prod([weights.get(f, 1.0) for f in families])),
+        )[0]
+
+    assert run({}) == {0, 2}
+    assert run({2: 1.2}) == {0, 1}  # 0.96 of 1.0 is not enough
+    assert run({2: 1.2, 1: 1.1}) == {0}
+    assert run({1: 0.8}) == {0, 1}
+    assert run({0: 1e6}) == {0, 2}  # what both have does not matter
 
 
 def test_search_takes_the_simplest_of_what_is_better():

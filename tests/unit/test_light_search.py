@@ -12,13 +12,8 @@ from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.emitters import METAL
 from iif_core.light.emission.find import find_light, look_around
 from iif_core.light.emission.groups import EmitterGroups
-from iif_core.light.emission.photographs import (
-    choose_rows,
-    escaping_light,
-    radiance_cache,
-    rays_from_surface,
-    seen_faces,
-)
+from iif_core.light.emission.odds import ObjectLooks
+from iif_core.light.emission.photographs import choose_rows, escaping_light, radiance_cache, rays_from_surface
 from iif_core.light.emission.response import calibrated
 from iif_core.light.emission.see_through import seen_through, translucent_objects
 from iif_core.light.emission.sun_search import _Rows, find_sun
@@ -46,6 +41,10 @@ def closed(llvm):
 def _found(photos, **asked):
     look = look_around(photos, neighbours(photos))
     return look, find_light(photos, look, **{"environment": False, "is_open": False, **asked})
+
+
+def _known(photos, threshold):
+    return ObjectLooks.of(photos, threshold).known(photos.scene, photos.options.min_observations)
 
 
 def test_lamps_of_a_closed_room(closed):
@@ -78,7 +77,7 @@ def test_the_same_light_twice_and_after_forgetting(closed):
 def test_a_lamp_that_nobody_sees(llvm):
     parts = {"baffle": _quad((0.5, 0.5, SIZE[2] - 0.4), (3, 0, 0), (0, 2, 0), 4), "bulb": None}
     photos, _ = photographed(Room(parts=parts, lights={"lamp": np.full(3, 50.0)}))
-    assert not seen_faces(photos, 1.0)[photos.scene.object_id == photos.names.index("lamp")].any()
+    assert not _known(photos, 1.0)[photos.scene.object_id == photos.names.index("lamp")].any()
     _, light = _found(photos)
     own = np.flatnonzero(light.found.groups.is_hidden)
     assert len(own) == 1 and light.hidden == 1 and "unseen lamp" in " ".join(light.notes)
@@ -94,7 +93,7 @@ def test_a_lamp_that_too_few_pixels_show(llvm, shines):
     photos = replace(photos, options=replace(photos.options, min_observations=shown + 1))
     look, light = _found(photos)
     assert (look.groups.of_face[bulb] < 0).all()
-    assert seen_faces(photos, look.threshold)[bulb].any() != shines
+    assert _known(photos, look.threshold)[bulb].any() != shines
     assert light.hidden == shines
     if shines:
         (own,) = np.flatnonzero(light.found.groups.is_hidden)

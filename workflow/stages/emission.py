@@ -71,6 +71,7 @@ def _photographs(job: Job, capture: CaptureReader, notes: list[str]) -> tuple[Ph
         options=options,
         log=Log(job.log.info, job.progress),
         base_level_error=PRIOR_LEVEL_ERROR if stated is None else stated.level,
+        up=tuple(capture.up),
     )
     measured = None
     if not isinstance(setting, str) and not capture.is_hdr:

@@ -24,7 +24,8 @@ from iif_core.light.emission.environment import Sky, sky_prior
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, BaseAlbedo, GainOptions, ObjectGains
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.hidden import with_hidden_surface
-from iif_core.light.emission.photographs import SEEDS, Photographs, choose_rows, radiance_cache, seen_faces
+from iif_core.light.emission.odds import LampOdds, ObjectLooks
+from iif_core.light.emission.photographs import SEEDS, Photographs, choose_rows, radiance_cache
 from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import (
     EmissionProblem,
@@ -105,9 +106,16 @@ class Traced:
 
 
 def trial(
-    photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, certain: float, threshold: float
+    photos: Photographs,
+    groups: EmitterGroups,
+    voxels: RadianceVoxels,
+    sky: Sky | None,
+    certain: float,
+    threshold: float,
+    odds: LampOdds,
 ) -> tuple[PrunedEmission, np.ndarray]:
-    """Find which groups emit light, and the albedo gains of objects (n_objects, 3), from half of the rows."""
+    """Find which groups emit light, and the albedo gains of objects (n_objects, 3), from half of the rows. Groups of objects that
+    are likely lamps stay."""
     pixels, rows = choose_rows(photos, groups, threshold, 2)
     own = rows.group >= 0
     transport = trace_rows(photos, pixels, groups, voxels, sky, 0).without_lobes()
@@ -117,7 +125,8 @@ def trial(
     n_groups = len(prior.initial)
     problem = assemble(rows, transport, n_groups, white, sky)
     tried, gains = problem.solve_object_gains(prior, base_albedo(photos, sky), photos.scene.n_objects)
-    family, protected = _families(photos, groups, n_groups), np.arange(n_groups) >= groups.size
+    family, protected = _families(photos, groups, n_groups), np.ones(n_groups, bool)
+    protected[: groups.size] = np.append(odds.is_likely, False)[_objects(photos, groups)]
     evidence = white_surface(rows, np.concatenate([seen, np.zeros((n_groups - groups.size, 3))]), white)
     share = photos.options.prune
     return prune_groups(tried.rows, prior, family, evidence, ~tried.anchor, protected, share, certain), reliable(gains)
@@ -161,19 +170,22 @@ def search_emitters(
     sky: Sky | None,
     threshold: float,
     hits: np.ndarray,
+    looks: ObjectLooks,
+    odds: LampOdds,
 ) -> tuple[Traced, np.ndarray, list[str]]:
     """Find whether other emitters explain the photographs better than those that the trial kept: with objects that no camera
     sees, with groups that were dropped although they may shine, or without some.
 
     pruned: of the trial, for all `groups`; certain: brightness relative to a white surface from which a group shines for certain;
-    hits: (F,) rays from visible surface that meet each face.
+    hits: (F,) rays from visible surface that meet each face; looks, odds: of the objects.
     Returns the problem of the emitters, which of `groups` are among them, and a description of what was changed.
     """
     # Groups were dropped one after the other; of some the light was given to others, and they may be needed after all.
     offered = np.flatnonzero(pruned.may_shine(certain, photos.options.prune)[: groups.size])
     lit, excess, power = (of_group[offered] for of_group in (pruned.kept, pruned.excess, pruned.power))
     scene, all_groups = photos.scene, groups.size
-    known = seen_faces(photos, threshold) | (groups.of_face >= 0)  # a candidate that was left out does not come back as unseen
+    # A candidate that was left out does not come back as unseen.
+    known = looks.known(scene, photos.options.min_observations) | (groups.of_face >= 0)
     groups = groups.select(np.isin(np.arange(groups.size), offered))
     every = with_hidden_surface(groups, known, scene.object_id, scene.areas, hits)
     family = _families(photos, every, every.size)
@@ -196,14 +208,19 @@ def search_emitters(
             misfits[chosen] = found.misfit
         return misfits[chosen]
 
-    start = frozenset(family[: groups.size][lit].tolist())
-    look = _first_look(photos, unseen, every, lit, family, sky, threshold, certain)
-    brightest = {f: float(excess[family[: groups.size] == f].max()) for f in start}
-    given = {f: float(power[family[: groups.size] == f].max()) for f in start}
+    owner = _objects(photos, every)
+    weights = np.ones(int(family.max(initial=-1)) + 1)
+    of_group = np.append(odds.weight, 1.0)[owner]
+    weights[family] = np.where(every.is_hidden, of_group, np.minimum(of_group, 1.0))  # what is seen is not unlikely
+    shown = frozenset(family[: groups.size][lit].tolist())
+    start = shown | frozenset(family[every.is_hidden & np.append(odds.is_likely, False)[owner]].tolist())
+    look = _first_look(photos, unseen, every, lit, family, sky, threshold, certain, weights)
+    brightest = {f: float(excess[family[: groups.size] == f].max()) for f in shown}
+    given = {f: float(power[family[: groups.size] == f].max()) for f in shown}
     suspects = sorted((f for f, value in brightest.items() if value < certain), key=lambda f: -given[f])[:SUSPECTS]
     # Without light from outside something in the room has to shine.
     doubtful = frozenset(f for f, value in brightest.items() if sky is not None and value < HIDDEN_EXCESS)
-    chosen, changes = search(start, lambda present: look.proposals(present, doubtful, frozenset(suspects)), misfit)
+    chosen, changes = search(start, lambda present: look.proposals(present, doubtful, frozenset(suspects)), misfit, look.weight)
     told, before = [], start
     for after, old, new in changes:
         parts = [(after - before, "added"), (before - after, "taken out")]
@@ -288,8 +305,10 @@ def _first_look(
     sky: Sky | None,
     threshold: float,
     certain: float,
+    weights: np.ndarray,
 ) -> Candidates:
-    """Trace all groups as columns of one problem, on some of the rows; of the first groups some are `lit`."""
+    """Trace all groups as columns of one problem, on some of the rows; of the first groups some are `lit`; `weights`: of the
+    families."""
     thin = -(-photos.options.rows // FIRST_LOOK_ROWS)
     cache = radiance_cache(photos, every)
     pixels, rows = choose_rows(photos, every, threshold, thin, comparison_tile(photos))
@@ -303,7 +322,8 @@ def _first_look(
     hidden = np.r_[every.is_hidden, np.zeros(outside, bool)]
     shown = np.concatenate([seen, np.zeros((outside, 3))])
     of_all = np.r_[family, np.full(outside, -1)]
-    return Candidates(problem, reflecting, of_group, prior, of_all, hidden, shown, white, base_albedo(photos, sky), certain)
+    albedo = base_albedo(photos, sky)
+    return Candidates(problem, reflecting, of_group, prior, of_all, hidden, shown, white, albedo, certain, weights)
 
 
 def _white_hidden_surface(
@@ -362,11 +382,20 @@ def solve(photos: Photographs, found: Traced, sky: Sky | None) -> EmissionSoluti
 def _families(photos: Photographs, groups: EmitterGroups, n_groups: int) -> np.ndarray:
     """(n_groups,) int: parts of one object shine alike, more or less, and so does its unseen surface; each group of the
     environment is alone."""
-    face = np.flatnonzero(groups.of_face >= 0)
     family = -1 - np.arange(n_groups)
-    family[groups.of_face[face]] = photos.scene.object_id[face]
+    family[: groups.size] = _objects(photos, groups)
     family[: groups.size][groups.is_hidden] += photos.scene.n_objects
     return family
+
+
+def _objects(photos: Photographs, groups: EmitterGroups) -> np.ndarray:
+    """(G,) int object to which most of the surface of each group belongs, -1 = surface of no object."""
+    face, scene = np.flatnonzero(groups.of_face >= 0), photos.scene
+    pair, at = np.unique(np.stack([groups.of_face[face], scene.object_id[face]], 1), axis=0, return_inverse=True)
+    area = np.bincount(at.ravel(), scene.areas[face], len(pair))
+    order, owner = np.argsort(area, kind="stable"), np.full(groups.size, -1)
+    owner[pair[order, 0]] = pair[order, 1]  # the largest part of each group comes last
+    return owner
 
 
 def reliable(gains: ObjectGains) -> np.ndarray:

@@ -19,6 +19,7 @@ from iif_core.light.emission.emitters import (
 )
 from iif_core.light.emission.environment import Sky, SkySums
 from iif_core.light.emission.groups import EmitterGroups, GroupingOptions, group_emitters
+from iif_core.light.emission.odds import LampOdds, ObjectLooks
 from iif_core.light.emission.photographs import (
     Photographs,
     escaping_light,
@@ -151,11 +152,13 @@ def find_light(photos: Photographs, look: FirstLook, environment: bool, is_open:
         share = f"{look.secondary:.0%} of the rays from the surface leave the mesh"
         notes.append(f"{share}: light from twelve directions, as the room shows it")
     certain = CERTAIN_EXCESS_OPEN if outside is not None and outside.is_unseen else CERTAIN_EXCESS
-    pruned, gain = trial(photos, groups, cache, outside, certain, threshold)
+    looks = ObjectLooks.of(photos, threshold)
+    odds = LampOdds.of(photos, looks)
+    pruned, gain = trial(photos, groups, cache, outside, certain, threshold, odds)
     unseen = photos.tracer.repainted(scene.with_gains(gain))
     reasons = np.array(pruned.reason[: groups.size], dtype=object)
     hits = np.bincount(look.met[look.met >= 0], minlength=len(scene.faces))
-    found, shines, changes = search_emitters(photos, unseen, groups, pruned, certain, outside, threshold, hits)
+    found, shines, changes = search_emitters(photos, unseen, groups, pruned, certain, outside, threshold, hits, looks, odds)
     for change in changes:
         photos.log.say(f"emitters: {change}")
     notes.extend(changes)

@@ -120,6 +120,7 @@ class Photographs:
     options: EmissionOptions
     log: Log
     base_level_error: float = PRIOR_LEVEL_ERROR  # of the logarithm of the level of the base
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # in the world
 
     @cached_property
     def cache_pixels(self) -> tuple[VoxelPixels, np.ndarray]:
@@ -218,30 +219,6 @@ def rays_from_surface(photos: Photographs) -> np.ndarray:
     if not origins:
         return np.full(1, -1)
     return np.asarray(photos.tracer.meets(np.concatenate(origins), np.concatenate(directions))[0])
-
-
-def seen_faces(photos: Photographs, threshold: float) -> np.ndarray:
-    """Return (F,) bool: a pixel shows the face, or light passes through it, so that no lamp can hide in it.
-
-    An object with too few interior pixels for a candidate counts as unseen if some pixel of it reaches `threshold` or is
-    saturated: it may be a small lamp, whose pixels are mixed with what is around it.
-    """
-    scene = photos.scene
-    shown, inside, bright = (
-        np.zeros(len(scene.faces), bool),
-        np.zeros(scene.n_objects + 1, int),
-        np.zeros(scene.n_objects + 1, bool),
-    )
-    for view in photos.views:
-        record = photos.records[view]
-        shown[record.pixels.face[record.pixels.valid] if record.seen is None else record.seen] = True
-        pixels = record.pixels.take(np.flatnonzero(record.pixels.valid))
-        radiance, bound = photos.radiance(view, pixels.value, pixels.index)
-        inside += np.bincount(pixels.object_id[pixels.interior], minlength=len(inside))
-        bright[pixels.object_id[(radiance.max(1) >= threshold) | bound.any(1)]] = True
-    hardly = bright & (inside < photos.options.min_observations)
-    hardly[-1] = False  # surface of no object, -1
-    return (shown & ~hardly[scene.object_id]) | (scene.passes > 0)
 
 
 def choose_rows(

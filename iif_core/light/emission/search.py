@@ -65,6 +65,7 @@ class Candidates:
         white: what a white surface would show in the place of hidden groups.
         albedo: of the base.
         certain: brightness relative to a white surface from which a family shines for certain.
+        weights: by number of the family, factor on the misfit if it shines: what is known of lamps before (`odds.LampOdds`).
     """
 
     problem: EmissionProblem
@@ -77,6 +78,11 @@ class Candidates:
     white: WhiteSurface
     albedo: BaseAlbedo
     certain: float
+    weights: np.ndarray
+
+    def weight(self, families: Families) -> float:
+        """Return the factor on the misfit of the families."""
+        return float(np.prod(self.weights[sorted(families)])) if families else 1.0
 
     def proposals(self, chosen: Families, doubtful: Families = frozenset(), suspects: Families = frozenset()) -> list[Proposal]:
         """Return sets of families that may explain the photographs better than `chosen`, the most promising first.
@@ -96,7 +102,9 @@ class Candidates:
         def with_added(families: Families, value: float, lit: EmissionProblem, most: int, out: int | None = None) -> None:
             for f in self._best_added(families, lit, NOTICEABLE * misfit)[:most]:
                 added, _, white = self._look(families | {f})
-                if added <= (1.0 - PROMISING) * value and not (out is not None and self._must_shine(out, white)):
+                if added * self.weights[f] <= (1.0 - PROMISING) * value and not (
+                    out is not None and self._must_shine(out, white)
+                ):
                     found[families | {f}] = added
 
         with_added(chosen, misfit, lit, _ADDED)
@@ -116,9 +124,12 @@ class Candidates:
             largest[rest] = look, _MISSED if reflects else 1.0 if out in doubtful else 1.0 - STEP
             if (rest or (self.family < 0).any()) and self._must_shine(out, white):
                 impossible.add(rest)
-        order = sorted(found.keys() - impossible, key=lambda f: (found[f] * (1.0 + PROMISING) ** len(f), sorted(f)))
+        order = sorted(
+            found.keys() - impossible, key=lambda f: (found[f] * self.weight(f) * (1.0 + PROMISING) ** len(f), sorted(f))
+        )
         growth = {families: largest.get(families, (1.0 - PROMISING, 1.0 - STEP)) for families in order}
-        worth = (f for f in order if f in always or found[f] <= growth[f][0] * misfit)
+        present = self.weight(chosen) * misfit
+        worth = (f for f in order if f in always or self.weight(f) * found[f] <= growth[f][0] * present)
         return [Proposal(f, growth[f][1], f in always, f & chosen not in impossible) for f in worth]
 
     def _look(self, chosen: Families) -> tuple[float, EmissionProblem, np.ndarray]:
@@ -205,7 +216,10 @@ def decrease(lit: EmissionProblem, column: np.ndarray) -> float:
 
 
 def search(
-    chosen: Families, proposals: Callable[[Families], list[Proposal]], misfit: Callable[[Families], float]
+    chosen: Families,
+    proposals: Callable[[Families], list[Proposal]],
+    misfit: Callable[[Families], float],
+    weight: Callable[[Families], float] = lambda families: 1.0,
 ) -> tuple[Families, list[tuple[Families, float, float]]]:
     """Change the emitters as long as others explain the photographs better by `STEP`; of those that do, a family more must be
     worth as much. Families that are taken out although the misfit grows do not come back.
@@ -213,7 +227,7 @@ def search(
     Args:
         chosen: families to begin with.
         proposals: sets of families that look better than a given one, best first.
-        misfit: of a set of families, from a separate trace.
+        misfit: of a set of families, from a separate trace; weight: factor on it, by which sets are compared.
 
     Returns:
         The families, and for each change: the families after it, and the misfit before and after.
@@ -230,10 +244,12 @@ def search(
         if not tried:
             break
         before, after = misfit(chosen), [misfit(proposal.families) for proposal in tried]
-        better = [i for i, value in enumerate(after) if value <= tried[i].largest_growth * before]
+        compared = [value * weight(proposal.families) for value, proposal in zip(after, tried, strict=True)]
+        present = before * weight(chosen)
+        better = [i for i, value in enumerate(compared) if value <= tried[i].largest_growth * present]
         if not better:
             break
-        best = min(better, key=lambda i: after[i] * (1.0 + STEP) ** len(tried[i].families))
+        best = min(better, key=lambda i: compared[i] * (1.0 + STEP) ** len(tried[i].families))
         if after[best] > before:
             gone |= chosen - tried[best].families
         chosen = tried[best].families

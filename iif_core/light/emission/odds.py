@@ -1,0 +1,141 @@
+"""How likely an object is to be a lamp before its light is asked for: where it hangs, and how bright it looks
+(docs/method/light.md#prior-odds-of-a-lamp)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from iif_core.light.base_scene import BaseScene
+from iif_core.light.emission.photographs import Photographs
+from iif_core.light.tracer import Tracer
+
+OVERHEAD = 0.94
+"""Height in its room, 0 = floor and 1 = ceiling, from which an object hangs overhead."""
+SATURATED = 0.85
+"""Share of the pixels of an object that are saturated, from which the object as a whole is."""
+LEAST_PIXELS = 4
+"""Pixels that must show that."""
+LIKELY, UNLIKELY = 9.0, 1.0 / 17.0
+"""Odds that an object is a lamp, relative to what is usual: of one that hangs overhead and is saturated; of one that no camera
+sees and that is not overhead."""
+WORTH = 15.0
+"""What a fall of the logarithm of the misfit by 1 is worth, as the logarithm of odds."""
+_STEP_OFF = 0.01
+"""Metres above and below an object at which rays to the ceiling and to the floor start."""
+
+
+@dataclass(frozen=True)
+class ObjectLooks:
+    """What the photographs show of objects, the last entry surface of no object.
+
+    Attributes:
+        faces: (F,) bool, some pixel shows the face.
+        pixels: (O + 1,) int, valid pixels; of these, inside: away from the border of the object, bright: as bright as an emitter
+            may be, bounded: saturated in some channel.
+    """
+
+    faces: np.ndarray
+    pixels: np.ndarray
+    inside: np.ndarray
+    bright: np.ndarray
+    bounded: np.ndarray
+
+    @classmethod
+    def of(cls, photos: Photographs, threshold: float) -> ObjectLooks:
+        """Count the pixels of each object; threshold: radiance from which surface may be an emitter."""
+        scene = photos.scene
+        faces, counts = np.zeros(len(scene.faces), bool), np.zeros((4, scene.n_objects + 1), int)
+        for view in photos.views:
+            record = photos.records[view]
+            faces[record.pixels.face[record.pixels.valid] if record.seen is None else record.seen] = True
+            pixels = record.pixels.take(np.flatnonzero(record.pixels.valid))
+            radiance, bound = photos.radiance(view, pixels.value, pixels.index)
+            bounded, owner = bound.any(1), np.where(pixels.object_id < 0, scene.n_objects, pixels.object_id)
+            kinds = np.ones_like(bounded), pixels.interior, (radiance.max(1) >= threshold) | bounded, bounded
+            for count, kind in zip(counts, kinds, strict=True):
+                count += np.bincount(owner[kind], minlength=len(count))
+        return cls(faces, *counts)
+
+    @property
+    def is_saturated(self) -> np.ndarray:
+        """(O,) bool: most of what is seen of the object is saturated."""
+        return (self.bounded >= np.maximum(SATURATED * self.pixels, LEAST_PIXELS))[:-1]
+
+    def known(self, scene: BaseScene, least: int) -> np.ndarray:
+        """Return (F,) bool: a pixel shows the face, or light passes through it, so that no lamp can hide in it.
+
+        An object with fewer than `least` pixels away from its border counts as unseen if some pixel of it is bright: it may be a
+        small lamp, whose pixels are mixed with what is around it.
+        """
+        hardly = (self.bright > 0) & (self.inside < least)
+        hardly[-1] = False  # surface of no object
+        return (self.faces & ~hardly[scene.object_id]) | (scene.passes > 0)
+
+
+def heights(tracer: Tracer, scene: BaseScene, objects: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return how high the middle of each of `objects` (k,) is between what is below it and what is above it, (k,) in [0, 1].
+
+    Where a ray meets nothing, the highest or the lowest point of the mesh stands for it. `up`: (3,) of any length above 0.
+    """
+    up = np.asarray(up, np.float64) / np.linalg.norm(up)
+    level = scene.vertices.astype(np.float64) @ up
+    bottom, top = float(level.min()), float(level.max())
+    number = np.full(scene.n_objects + 1, -1)
+    number[objects] = np.arange(len(objects))
+    face = np.flatnonzero(number[scene.object_id] >= 0)
+    own, corner = number[scene.object_id[face]], level[scene.faces[face]]
+    low, high = np.full(len(objects), np.inf), np.full(len(objects), -np.inf)
+    np.minimum.at(low, own, corner.min(1))
+    np.maximum.at(high, own, corner.max(1))
+    area = np.maximum(np.bincount(own, scene.areas[face], len(objects)), 1e-300)
+    middles = scene.vertices[scene.faces[face]].mean(1) * scene.areas[face][:, None]
+    middle = np.stack([np.bincount(own, middles[:, c], len(objects)) for c in range(3)], 1) / area[:, None]
+
+    def clearance(start: np.ndarray, sign: float, most: np.ndarray) -> np.ndarray:
+        """Distance from `start` (k,), heights, to what is met above (+1) or below (-1)."""
+        points = middle + ((start + sign * _STEP_OFF) - middle @ up)[:, None] * up
+        face, distance = tracer.meets(points, np.broadcast_to(sign * up, points.shape))
+        return np.where(face >= 0, distance + _STEP_OFF, np.maximum(most, 0.0))
+
+    ceiling = high + clearance(high, 1.0, top - high)
+    floor = low - clearance(low, -1.0, low - bottom)
+    return np.clip((middle @ up - floor) / np.maximum(ceiling - floor, 1e-9), 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class LampOdds:
+    """How likely objects are to be lamps.
+
+    Attributes:
+        odds: (O,) relative to what is usual.
+    """
+
+    odds: np.ndarray
+
+    @classmethod
+    def of(cls, photos: Photographs, looks: ObjectLooks) -> LampOdds:
+        """Judge all objects; those that cameras see are as likely as is usual, unless they are saturated and overhead."""
+        scene = photos.scene
+        count = scene.n_objects
+        known = looks.known(scene, photos.options.min_observations)
+        seen, exists = (
+            np.bincount(scene.object_id[faces & (scene.object_id >= 0)], minlength=count) > 0 for faces in (known, ~known)
+        )
+        asked = np.flatnonzero(looks.is_saturated | (exists & ~seen))
+        overhead = np.zeros(count, bool)
+        if len(asked):
+            overhead[asked] = heights(photos.tracer, scene, asked, np.asarray(photos.up)) >= OVERHEAD
+        likely = overhead & looks.is_saturated
+        return cls(np.where(likely, LIKELY, np.where(seen | overhead, 1.0, UNLIKELY)))
+
+    @property
+    def is_likely(self) -> np.ndarray:
+        """(O,) bool: the object hangs overhead, and what is seen of it is saturated."""
+        return self.odds > 1.0
+
+    @property
+    def weight(self) -> np.ndarray:
+        """(O,) factor on the misfit of light in which the object shines, odds^(-1 / WORTH)."""
+        return self.odds ** (-1.0 / WORTH)
