@@ -27,9 +27,13 @@ _BASE_FACTOR, _BASE_FACTORS, _BASE_FACTOR_WIDTH = 1.4, np.geomspace(0.3, 6.0, 15
 is sought; width (of the logarithm) of its prior."""
 _LIGHT_FACTORS, _LIGHT_FACTOR, _LIGHT_FACTOR_WIDTH = np.geomspace(0.5, 4.0, 13), 1.5, 0.35
 """The same for the factor between the error that all pixels of an object share and its smooth part within the object."""
-_SHARED_LIGHT_ERROR = 0.12
+SHARED_LIGHT_ERROR = 0.12
 """Error of the light that all pixels of an object share, as a logarithm, and that no variation within the object shows. It is
 added where the prior states its errors."""
+_PER_ROOT_MISFIT, _SHARED_LIGHT_ERRORS = 1.0, (0.03, 0.6)
+"""The same for a root mean square of 1 of what the light leaves unexplained; its limits."""
+_OWN_SHARE = 0.6
+"""Share of the stated error of the base that the light does not have too: only this part shows in a discrepancy."""
 _QUARTILES = 1.349
 """Distance of the quartiles of a normal distribution, in standard deviations."""
 _MIDDLE_ALBEDO = 0.3
@@ -90,6 +94,14 @@ class ObjectLevels:
             "normalised_discrepancy": float(share @ np.minimum(away, 10.0)),
             "divided": self.is_divided,
         }
+
+
+def shared_light_error(misfit: float | None) -> float:
+    """Return the error of the light on an object as a whole, as a logarithm, from the misfit of the light (Eq. L.40), None = not
+    known."""
+    if misfit is None or not np.isfinite(misfit):
+        return SHARED_LIGHT_ERROR
+    return float(np.clip(_PER_ROOT_MISFIT * np.sqrt(max(misfit, 0.0)), *_SHARED_LIGHT_ERRORS))
 
 
 def prediction_scatter(
@@ -183,7 +195,7 @@ def measure_levels(
     pixels = np.where(is_told, px.usable, 0.0)
     smooth = _smooth_error_of_light(np.clip(step, -_LARGEST_STEP, _LARGEST_STEP), weight, owner, pixels)
     stated = None if opt.prediction_errors is None else opt.prediction_errors.brightness
-    levels = compare_levels(base, shown, scatter, smooth, pixels, opt.base_tells_levels, stated)
+    levels = compare_levels(base, shown, scatter, smooth, pixels, opt.base_tells_levels, stated, opt.light_error)
     return replace(levels, light_gain=np.where(is_told, levels.light_gain, 1.0))
 
 
@@ -230,6 +242,7 @@ def compare_levels(
     pixels: np.ndarray,
     base_tells_levels: bool = True,
     stated: float | None = None,
+    shared: float = SHARED_LIGHT_ERROR,
 ) -> ObjectLevels:
     """Learn the errors of both estimates and divide each discrepancy between them (Eq. M.34 to M.36).
 
@@ -241,6 +254,7 @@ def compare_levels(
         pixels: (O,) by which objects count.
         stated: error of the base for an albedo of 0.3 (`PredictionErrors.brightness`), and neither error is learnt; None = both
             are, by means of `scatter` and `smooth`.
+        shared: error of the light on an object as a whole, where an error of the base is stated.
         base_tells_levels: False = both errors are what is usual, no discrepancy is divided, and the light keeps its whole error.
     """
     pixels = pixels if pixels.any() else np.ones(len(pixels))
@@ -254,7 +268,7 @@ def compare_levels(
         middle = (scatter / size)[order][np.searchsorted(np.cumsum(pixels[order]), 0.5 * pixels.sum())]
         usual = _BASE_FACTOR * np.maximum(middle, _SMALLEST_ERROR) * size
     else:
-        usual = stated * size
+        usual = _OWN_SHARE * stated * size
 
     # -------- factors kappa_B and kappa_L on both errors, from the scatter of the discrepancies (Eq. M.35) --------
     # `share` is w_o, `count` the effective number N of objects.
@@ -262,7 +276,7 @@ def compare_levels(
     share = pixels[some] / max(pixels[some].sum(), 1e-100)
     count = 1.0 / max(float((share**2).sum()), 1e-100)
     best = (-np.inf, 1.0, _LIGHT_FACTOR, np.ones(3))
-    is_learnt, shared = base_tells_levels and stated is None, 0.0 if stated is None else _SHARED_LIGHT_ERROR
+    is_learnt, shared = base_tells_levels and stated is None, 0.0 if stated is None else shared
     for of_base in _BASE_FACTORS if is_learnt else (1.0,):
         for of_light in _LIGHT_FACTORS if is_learnt else (_LIGHT_FACTOR,):
             own, light = of_base * usual[some], np.hypot(of_light * smooth[some], shared)

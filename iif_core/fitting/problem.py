@@ -99,6 +99,7 @@ class FitOptions:
         metallic_prior: see `select`.
         base_tells_levels: the base is a second witness of the brightness of objects, next to the photographs.
         prediction_errors: how the predictions err that the base was made of; None: not known, and learnt from the scene.
+        light_error: of the light on an object as a whole, as a logarithm; it counts where `prediction_errors` are known.
         texture_sigma: standard deviation of the albedo above which a direction of the texture counts.
         brightest: largest albedo in the fit. It exceeds 1 because in light that is a little too dim a white wall would otherwise
             be explained by a gloss that it does not have. Published albedos lie within [0, 1].
@@ -122,6 +123,7 @@ class FitOptions:
     metallic_prior: float = 0.25
     base_tells_levels: bool = True
     prediction_errors: PredictionErrors | None = None
+    light_error: float = 0.12
     texture_sigma: float = 2.0 / 255.0
     brightest: float = 1.25
     threads: int = 1

@@ -10,7 +10,7 @@ from iif_core.camera.response import response
 from iif_core.fitting import object_levels
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import Gauge, apply_gauge
-from iif_core.fitting.object_levels import compare_levels, relative_error_of_base
+from iif_core.fitting.object_levels import SHARED_LIGHT_ERROR, compare_levels, relative_error_of_base, shared_light_error
 from iif_core.fitting.predictions import PredictionErrors
 from iif_core.fitting.problem import FitOptions
 from iif_core.fitting.selection import EVIDENCE_DISCOUNT, ROUGHNESS_GRID, Profile, choose_kinds
@@ -89,15 +89,26 @@ def test_roughness_follows_the_base_where_photographs_say_nothing():
 
 
 def test_an_error_that_is_stated_is_not_learnt_again():
-    """The base errs by 0.3 everywhere and its predictions agree to 0.02: the light, which is right, is believed to be."""
+    """The base errs by 0.2 and its predictions agree to 0.02: the light, which is right, is believed to be."""
     rng = np.random.default_rng(3)
     truth = rng.uniform(0.1, 0.8, (60, 1)) * np.ones((1, 3))
     size = relative_error_of_base(truth.mean(1))
     base = truth * np.exp(0.2 * size * rng.normal(size=60))[:, None]
     shown = truth * np.exp(0.05 * rng.normal(size=60))[:, None]
-    levels = compare_levels(base, shown, np.full(60, 0.02), np.full(60, 0.05), np.full(60, 100.0), stated=0.2)
-    np.testing.assert_allclose(levels.base_error, 0.2 * relative_error_of_base(base.mean(1)), rtol=1e-12)
+    scatter, smooth, pixels = np.full(60, 0.02), np.full(60, 0.05), np.full(60, 100.0)
+    levels = compare_levels(base, shown, scatter, smooth, pixels, stated=0.2, shared=0.05)
+    # Of the stated error, 0.6 is the base's alone.
+    np.testing.assert_allclose(levels.base_error, 0.12 * relative_error_of_base(base.mean(1)), rtol=1e-12)
     assert np.std(np.log(levels.light_gain)) < 0.09
+    # Light that explains the photographs badly is believed less.
+    worse = compare_levels(base, shown, scatter, smooth, pixels, stated=0.2, shared=0.3)
+    assert np.std(np.log(worse.light_gain)) > 1.5 * np.std(np.log(levels.light_gain))
+
+
+def test_error_of_the_light_on_an_object_from_what_the_light_leaves_unexplained():
+    assert [shared_light_error(misfit) for misfit in (0.01, 0.04)] == pytest.approx([0.1, 0.2])
+    assert [shared_light_error(misfit) for misfit in (0.0, -1e-4, 1e9)] == [0.03, 0.03, 0.6]
+    assert all(shared_light_error(unknown) == SHARED_LIGHT_ERROR for unknown in (None, np.inf, np.nan))
     assert relative_error_of_base(np.array([0.3]))[0] == 1 and np.isfinite(relative_error_of_base(np.array([0.0, 9.0]))).all()
 
 
@@ -135,5 +146,7 @@ def test_a_level_that_the_prior_knows_better_counts_more():
 def test_statements_change_nothing_where_nothing_is_open():
     """Exact photographs decide everything by themselves."""
     problem, truth = problem_of(np.random.default_rng(5))
-    plain, stated = (fit_affines(problem, response("identity"), FitOptions(prediction_errors=e)) for e in (None, ERRORS))
+    plain, stated = (
+        fit_affines(problem, response("identity"), FitOptions(prediction_errors=e, light_error=0.03)) for e in (None, ERRORS)
+    )
     np.testing.assert_allclose(stated.affine[:, 13:], plain.affine[:, 13:], atol=0.05)

@@ -9,6 +9,7 @@ import numpy as np
 from iif_core.camera.response import Response
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import apply_gauge
+from iif_core.fitting.object_levels import shared_light_error
 from iif_core.fitting.problem import FitOptions, FitProblem, FitResult
 from workflow.fitting.affine_files import write_fit
 from workflow.fitting.fit_input import Draw, read_fit
@@ -60,6 +61,7 @@ def _direct(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Solver:
         lobes=has_lobes(job),
         metals=job.settings.components.metallic != "off",
         prediction_errors=prediction_errors(job),
+        light_error=shared_light_error(job.read("emission").json("emission.json").get("misfit")),
         threads=job.threads,
     )
     return lambda problem, start: fit_affines(problem, start, options)

@@ -154,6 +154,7 @@ def find_light(photos: Photographs, look: FirstLook, environment: bool, is_open:
     certain = CERTAIN_EXCESS_OPEN if outside is not None and outside.is_unseen else CERTAIN_EXCESS
     looks = ObjectLooks.of(photos, threshold)
     odds = LampOdds.of(photos, looks)
+    photos.log.say(f"{odds.is_likely.sum()} objects hang overhead and are saturated: they are likely lamps")
     pruned, gain = trial(photos, groups, cache, outside, certain, threshold, odds)
     unseen = photos.tracer.repainted(scene.with_gains(gain))
     reasons = np.array(pruned.reason[: groups.size], dtype=object)

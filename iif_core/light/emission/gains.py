@@ -14,7 +14,7 @@ from iif_core.light.emission.rows import EmissionRows, light_of
 
 PRIOR_LEVEL_ERROR = 0.35
 """Standard deviation of the logarithm of the level of the light that the mean albedo of the base texture implies."""
-SHARED_LEVEL_ERROR = 0.2
+SHARED_LEVEL_ERROR = 0.3
 """Systematic error of the logarithm of the level, common to all objects: light that geometry, cache and materials lose."""
 _STEPS = 4
 BASE_COLOUR_ERROR = 0.05

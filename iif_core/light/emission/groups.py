@@ -43,7 +43,7 @@ class EmitterGroups:
 
     @property
     def is_hidden(self) -> np.ndarray:
-        """(G,) bool: no camera sees the group, or hardly (`seen_faces`)."""
+        """(G,) bool: no camera sees the group, or hardly (`odds.ObjectLooks.known`)."""
         return self.count == 0
 
     def select(self, kept: np.ndarray) -> EmitterGroups:
