@@ -120,7 +120,8 @@ class Candidates:
             # Fewer families are worth a trace of their own if they explain nearly as much. How bright saturated surface is that
             # only reflects is not known before that trace.
             look = _MISSED if self._is_saturated(out) else 1.0 + PROMISING
-            reflects = bool(rest) and self._excess(out, white) < 1.0
+            # Of a likely lamp, saturated, the excess is a lower bound and speaks for nothing.
+            reflects = bool(rest) and self.weights[out] >= 1.0 and self._excess(out, white) < 1.0
             largest[rest] = look, _MISSED if reflects else 1.0 if out in doubtful else 1.0 - STEP
             if (rest or (self.family < 0).any()) and self._must_shine(out, white):
                 impossible.add(rest)
