@@ -257,9 +257,20 @@ def test_an_unlikely_family_must_explain_more_and_a_likely_one_less():
     gone = frozenset({0, 2})
     # White surface would be as bright as family 1, which makes it easier to take out, but not if it is likely.
     slightly = _growth(replace(room, weights=np.array([1.0, 1.0 - 1e-9, 1.0, 1.0])), 0, 1, 2)
-    assert _growth(room, 0, 1, 2)[gone] == pytest.approx(1.5) and slightly.get(gone, 1 - STEP) == 1 - STEP
+    assert _growth(room, 0, 1, 2)[gone] == pytest.approx(1.5) and slightly[gone] == 1 - STEP
     likely = replace(room, weights=np.array([1.0, 1e-3, 1.0, 1.0]))
     assert gone in _growth(room, 0, 1, 2) and gone not in _growth(likely, 0, 1, 2)
+
+
+def test_an_unseen_likely_lamp_that_white_surface_would_match_does_not_end_the_search():
+    """Family 3 is dark and a white surface in its place bright: with it nothing else could be compared."""
+    room = _room(1.0)
+    cached = room.white.cached.copy()
+    cached[3] = 100.0
+    bright = replace(room, white=replace(room.white, cached=cached))
+    assert not any(2 in families for families in _growth(bright, 0, 3))
+    likely = replace(bright, weights=np.array([1.0, 1.0, 1.0, 0.86]))
+    assert any(2 in families for families in _growth(likely, 0, 3))
 
 
 def test_search_compares_weighted_misfits():

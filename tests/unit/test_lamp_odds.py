@@ -1,10 +1,12 @@
 """How likely objects are to be lamps before their light is asked for."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from iif_core.light.emission import emitters
 from iif_core.light.emission.odds import (
     LEAST_PIXELS,
     LIKELY,
@@ -16,7 +18,7 @@ from iif_core.light.emission.odds import (
     heights,
 )
 from tests.unit.photographed_room import of_views, photographed
-from tests.workflow.light_room import LAMP, Room, _quad
+from tests.workflow.light_room import LAMP, SIZE, Room, _quad
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -50,6 +52,15 @@ def test_heights_where_rays_meet_nothing(llvm):
     photos = photographed(Room(parts=dict.fromkeys(("ceiling", "floor"))))[0]
     found = _heights(photos)
     assert found["lamp"] > OVERHEAD and 0.4 < found["wall_a"] < 0.6
+
+
+@pytest.mark.parametrize("below", [0.002, 0.03])
+def test_a_lamp_that_is_flush_with_the_ceiling_is_overhead(llvm, below):
+    """Also under an attic, which must not count as its room."""
+    spot = _quad((1.0, 1.0, SIZE[2] - below), (0, 0.2, 0), (0.2, 0, 0), 1)
+    attic = _quad((0.0, 0.0, SIZE[2] + 1.0), (SIZE[0], 0, 0), (0, SIZE[1], 0), 1)
+    found = _heights(photographed(Room(parts={"spot": spot, "attic": attic}))[0])
+    assert found["spot"] > OVERHEAD and found["floor"] < 0.1
 
 
 def test_a_ceiling_of_its_own_counts(llvm):
@@ -125,3 +136,9 @@ def test_saturated_as_a_whole(pixels, bounded, is_saturated):
     assert SATURATED == 0.85 and LEAST_PIXELS == 4
     counts = (np.array([value, 0]) for value in (pixels, 0, bounded, bounded))
     assert ObjectLooks(np.zeros(1, bool), *counts).is_saturated.tolist() == [is_saturated]
+
+
+def test_a_group_belongs_to_the_object_with_most_of_its_surface():
+    scene = SimpleNamespace(object_id=np.array([2, 0, 0, 1, -1]), areas=np.array([1.0, 0.3, 0.3, 5.0, 1.0]))
+    groups = SimpleNamespace(of_face=np.array([0, 0, 0, -1, 1]), size=3)
+    assert emitters._objects(SimpleNamespace(scene=scene), groups).tolist() == [2, -1, -1]

@@ -189,7 +189,7 @@ def search_emitters(
     groups = groups.select(np.isin(np.arange(groups.size), offered))
     every = with_hidden_surface(groups, known, scene.object_id, scene.areas, hits)
     family = _families(photos, every, every.size)
-    family[: groups.size][~lit] += 2 * scene.n_objects
+    family[: groups.size][~lit] += 2 * scene.n_objects + 1  # surface of no object, -1, has a number of its own
     family = np.unique(family, return_inverse=True)[1]
     # A lamp that comes back must be needed by other surface than its own.
     weak = np.isin(every.of_face, np.flatnonzero(~lit))
@@ -219,13 +219,13 @@ def search_emitters(
     given = {f: float(power[family[: groups.size] == f].max()) for f in shown}
     suspects = sorted((f for f, value in brightest.items() if value < certain), key=lambda f: -given[f])[:SUSPECTS]
     # Without light from outside something in the room has to shine.
-    doubtful = frozenset(f for f, value in brightest.items() if sky is not None and value < HIDDEN_EXCESS)
+    doubtful = frozenset(f for f, value in brightest.items() if sky is not None and value < HIDDEN_EXCESS and weights[f] >= 1.0)
     chosen, changes = search(start, lambda present: look.proposals(present, doubtful, frozenset(suspects)), misfit, look.weight)
     told, before = [], start
     for after, old, new in changes:
         parts = [(after - before, "added"), (before - after, "taken out")]
         what = [f"{_names(photos, every, family, f)} {word}" for families, word in parts for f in sorted(families)]
-        turn = "falls" if new < old else "grows, as white surface would be no less bright,"
+        turn = "falls" if new < old else "grows, less than what is known of lamps and of white surface outweighs,"
         told.append(f"{' and '.join(what)}: the misfit of the light {turn} from {old:.4f} to {new:.4f}")
         before = after
     emitters, shines = every.select(np.isin(family, [*chosen])), np.zeros(all_groups, bool)

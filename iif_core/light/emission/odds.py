@@ -23,7 +23,10 @@ sees and that is not overhead."""
 WORTH = 15.0
 """What a fall of the logarithm of the misfit by 1 is worth, as the logarithm of odds."""
 _STEP_OFF = 0.01
-"""Metres above and below an object at which rays to the ceiling and to the floor start."""
+"""Metres below the highest and the lowest point of an object at which its vertical rays start. Many lamps are flush with the ceiling,
+so the ray upwards starts inside the object, and passes it."""
+_OWN_LAYERS = 8
+"""Layers of an object that a ray passes."""
 
 
 @dataclass(frozen=True)
@@ -93,14 +96,19 @@ def heights(tracer: Tracer, scene: BaseScene, objects: np.ndarray, up: np.ndarra
     middles = scene.vertices[scene.faces[face]].mean(1) * scene.areas[face][:, None]
     middle = np.stack([np.bincount(own, middles[:, c], len(objects)) for c in range(3)], 1) / area[:, None]
 
-    def clearance(start: np.ndarray, sign: float, most: np.ndarray) -> np.ndarray:
-        """Distance from `start` (k,), heights, to what is met above (+1) or below (-1)."""
-        points = middle + ((start + sign * _STEP_OFF) - middle @ up)[:, None] * up
-        face, distance = tracer.meets(points, np.broadcast_to(sign * up, points.shape))
-        return np.where(face >= 0, distance + _STEP_OFF, np.maximum(most, 0.0))
+    def end(start: np.ndarray, sign: float, otherwise: float) -> np.ndarray:
+        """Height (k,) of what is met above (+1) or below (-1) the heights `start` (k,), other than the object itself."""
+        at, found = start.copy(), np.full(len(objects), np.nan)
+        for _ in range(_OWN_LAYERS):
+            points = middle + (at - middle @ up)[:, None] * up
+            face, distance = tracer.meets(points, np.broadcast_to(sign * up, points.shape))
+            at = np.where(face >= 0, at + sign * (distance + 1e-4), at)  # on, past what was met
+            is_own = (face >= 0) & (scene.object_id[face] == objects)
+            found = np.where(np.isnan(found) & ~is_own, np.where(face >= 0, at, otherwise), found)
+        return np.where(np.isnan(found), otherwise, found)
 
-    ceiling = high + clearance(high, 1.0, top - high)
-    floor = low - clearance(low, -1.0, low - bottom)
+    ceiling = np.maximum(end(high - _STEP_OFF, 1.0, top), high)
+    floor = np.minimum(end(low - _STEP_OFF, -1.0, bottom), low)
     return np.clip((middle @ up - floor) / np.maximum(ceiling - floor, 1e-9), 0.0, 1.0)
 
 

@@ -144,8 +144,9 @@ class Candidates:
         radiance = prior.radiance(solved.rows, QUICK.rounds)
         light = self.shown.copy()
         light[keep] = radiance
-        # Unseen surface that a white one could match is no lamp: the rest of the light is wrong.
-        reflects = (replace(self.white, seen=light).excess(light) < HIDDEN_EXCESS) & self.hidden & keep
+        # Unseen surface that a white one could match is no lamp, unless it is a likely one: the rest of the light is wrong.
+        doubted = self.hidden & keep & (np.append(self.weights, 1.0)[self.family] >= 1.0)
+        reflects = (replace(self.white, seen=light).excess(light) < HIDDEN_EXCESS) & doubted
         misfit = np.inf if reflects.any() else solved.misfit(radiance)
         return misfit, lit_problem(every.with_gains(gains), light), self._white(light)
 
