@@ -23,8 +23,8 @@ sees and that is not overhead."""
 WORTH = 15.0
 """What a fall of the logarithm of the misfit by 1 is worth, as the logarithm of odds."""
 _STEP_OFF = 0.01
-"""Metres below the highest and the lowest point of an object at which its vertical rays start. Many lamps are flush with a ceiling,
-so the ray upwards starts inside the object, and passes it."""
+"""Metres below the highest and the lowest point of an object at which its vertical rays start. Many lamps are flush with a
+ceiling, so the ray upwards starts inside the object, and passes it."""
 _OWN_LAYERS = 8
 """Layers of an object that a ray passes."""
 
