@@ -30,9 +30,9 @@ _LIGHT_FACTORS, _LIGHT_FACTOR, _LIGHT_FACTOR_WIDTH = np.geomspace(0.5, 4.0, 13),
 SHARED_LIGHT_ERROR = 0.12
 """Error of the light that all pixels of an object share, as a logarithm, and that no variation within the object shows. It is
 added where the prior states its errors."""
-_PER_ROOT_MISFIT, _SHARED_LIGHT_ERRORS = 1.0, (0.03, 0.6)
+_PER_ROOT_MISFIT, _SHARED_LIGHT_ERRORS = 0.7, (0.03, 0.6)
 """The same for a root mean square of 1 of what the light leaves unexplained; its limits."""
-_OWN_SHARE = 0.6
+_OWN_SHARE = 0.8
 """Share of the stated error of the base that the light does not have too: only this part shows in a discrepancy."""
 _QUARTILES = 1.349
 """Distance of the quartiles of a normal distribution, in standard deviations."""
