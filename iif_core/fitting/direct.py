@@ -140,7 +140,8 @@ def _descend_all(
             population = update_population(
                 fit.population, terms, state.affine, state.free, noise, roughness, fit.metallic, EVIDENCE_DISCOUNT
             )
-            levels = measure_levels(some, state.affine, tone.at(state.params), opt, texture.mean[:, :3], scatter, light_gain)
+            curve, base = tone.at(state.params), texture.mean[:, :3]
+            levels = measure_levels(some, state.affine, curve, opt, base, scatter, light_gain, _metal(fit))
             light_gain = levels.light_gain
             some = replace(some, exposure=exposure * light_gain[some.obj])
             fit = replace(fit, state=state, population=population, levels=levels)
@@ -163,6 +164,13 @@ def _descend_all(
     weigh_by_halves(px, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.response_weight)
     state, _ = descend(px, fit.state, fit.prior, tone, opt, None, start_params)
     return replace(fit, state=state)
+
+
+def _metal(fit: FitProgress) -> np.ndarray | None:
+    """Probability (O,) that what is taken for a metal is one, 0 for everything else; None: kinds were not chosen."""
+    if fit.kinds is None:
+        return None
+    return np.where(fit.kinds.probability.argmax(1) == 1, fit.kinds.probability[:, 1], 0.0)
 
 
 def weigh_by_halves(

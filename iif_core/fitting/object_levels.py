@@ -34,6 +34,9 @@ _PER_ROOT_MISFIT, _SHARED_LIGHT_ERRORS = 0.7, (0.03, 0.6)
 """The same for a root mean square of 1 of what the light leaves unexplained; its limits."""
 _OWN_SHARE = 0.8
 """Share of the stated error of the base that the light does not have too: only this part shows in a discrepancy."""
+_BASE_OF_METAL, _LIGHT_ON_METAL, _NO_METAL = 0.6, 0.3, 1.0
+"""Where the prior states its errors, those of a metal's base (a metal that reflects something dark looks like dark paint) and of the
+light on it as a whole; and of the light on what was wrongly taken for one."""
 _QUARTILES = 1.349
 """Distance of the quartiles of a normal distribution, in standard deviations."""
 _MIDDLE_ALBEDO = 0.3
@@ -147,6 +150,7 @@ def measure_levels(
     mean_base: np.ndarray,
     scatter: np.ndarray,
     light_gain: np.ndarray,
+    metal: np.ndarray | None = None,
 ) -> ObjectLevels:
     """Compare both estimates of each level and learn the error of each (Eq. M.32 to M.36).
 
@@ -158,6 +162,7 @@ def measure_levels(
         mean_base: (O, 3) mean base albedo; scatter: (O,) of the predictions (`prediction_scatter`), which counts where the prior
             does not state its errors.
         light_gain: (O,) factor on the light of each object that is in the exposure of `px`.
+        metal: (O,) probability that what is taken for a metal is one, 0 for everything else; None = there is none.
     """
     n = px.n_objects
     base = np.maximum(np.asarray(mean_base, np.float64), _DARKEST_LEVEL)
@@ -195,7 +200,7 @@ def measure_levels(
     pixels = np.where(is_told, px.usable, 0.0)
     smooth = _smooth_error_of_light(np.clip(step, -_LARGEST_STEP, _LARGEST_STEP), weight, owner, pixels)
     stated = None if opt.prediction_errors is None else opt.prediction_errors.brightness
-    levels = compare_levels(base, shown, scatter, smooth, pixels, opt.base_tells_levels, stated, opt.light_error)
+    levels = compare_levels(base, shown, scatter, smooth, pixels, opt.base_tells_levels, stated, opt.light_error, metal)
     return replace(levels, light_gain=np.where(is_told, levels.light_gain, 1.0))
 
 
@@ -243,6 +248,7 @@ def compare_levels(
     base_tells_levels: bool = True,
     stated: float | None = None,
     shared: float = SHARED_LIGHT_ERROR,
+    metal: np.ndarray | None = None,
 ) -> ObjectLevels:
     """Learn the errors of both estimates and divide each discrepancy between them (Eq. M.34 to M.36).
 
@@ -255,6 +261,8 @@ def compare_levels(
         stated: error of the base for an albedo of 0.3 (`PredictionErrors.brightness`), and neither error is learnt; None = both
             are, by means of `scatter` and `smooth`.
         shared: error of the light on an object as a whole, where an error of the base is stated.
+        metal: (O,) probability that what is taken for a metal is one, 0 for everything else, where an error of the base is stated;
+            None = there is none.
         base_tells_levels: False = both errors are what is usual, no discrepancy is divided, and the light keeps its whole error.
     """
     pixels = pixels if pixels.any() else np.ones(len(pixels))
@@ -269,6 +277,8 @@ def compare_levels(
         usual = _BASE_FACTOR * np.maximum(middle, _SMALLEST_ERROR) * size
     else:
         usual = _OWN_SHARE * stated * size
+        is_one = np.zeros(len(base)) if metal is None else metal
+        usual = np.sqrt((1.0 - is_one) * usual**2 + is_one * np.maximum(usual, _BASE_OF_METAL) ** 2)
 
     # -------- factors kappa_B and kappa_L on both errors, from the scatter of the discrepancies (Eq. M.35) --------
     # `share` is w_o, `count` the effective number N of objects.
@@ -276,10 +286,14 @@ def compare_levels(
     share = pixels[some] / max(pixels[some].sum(), 1e-100)
     count = 1.0 / max(float((share**2).sum()), 1e-100)
     best = (-np.inf, 1.0, _LIGHT_FACTOR, np.ones(3))
-    is_learnt, shared = base_tells_levels and stated is None, 0.0 if stated is None else shared
+    is_learnt = base_tells_levels and stated is None
+    of_object = np.zeros(len(base))
+    if stated is not None:
+        of_metal = is_one * _LIGHT_ON_METAL**2 + (1.0 - is_one) * _NO_METAL**2
+        of_object = np.sqrt(shared**2 + np.where(is_one > 0, of_metal, 0.0))
     for of_base in _BASE_FACTORS if is_learnt else (1.0,):
         for of_light in _LIGHT_FACTORS if is_learnt else (_LIGHT_FACTOR,):
-            own, light = of_base * usual[some], np.hypot(of_light * smooth[some], shared)
+            own, light = of_base * usual[some], np.hypot(of_light * smooth[some], of_object[some])
             gain, away = _mean_gain(base[some], shown[some], share, np.hypot(own, light))
             # `usual` contains the factor 1.4 already, so `of_base` is relative to it.
             log_prior = -0.5 * (np.log(of_base) / _BASE_FACTOR_WIDTH) ** 2
@@ -291,7 +305,7 @@ def compare_levels(
 
     # -------- what of each discrepancy belongs to the light (Eq. M.34, M.36) --------
     discrepancy = np.log(shown.sum(1) / (base @ gain))
-    base_error, light_error = of_base * usual, np.hypot(of_light * smooth, shared)
+    base_error, light_error = of_base * usual, np.hypot(of_light * smooth, of_object)
     if not base_tells_levels:
         found = np.ones(len(base)), _T_INTERVAL * light_error
         return ObjectLevels(base, shown, discrepancy, light_error, base_error, gain, *found, pixels, is_divided=False)

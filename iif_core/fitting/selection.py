@@ -34,6 +34,11 @@ _PRIOR_OF_KINDS = np.array([[0.85], [0.1], [0.05]])
 EVIDENCE_DISCOUNT = 20.0
 """Factor on the variance of a row in the evidence (Eq. M.21). The scatter between clusters shows what varies over an object, but
 not the errors of light and geometry that the whole object shares."""
+_METAL_ODDS = (-1.74, 0.38, 0.70, 1.22)
+"""Logarithm of the odds of metal where the prior states its errors (Eq. M.56): constant, and what counts of the odds that the base
+states, of the evidence of the photographs, and of the brightness that a metal would have relative to the base."""
+_BRIGHTER = (-1.0, 1.5)
+"""Limits of the logarithm of that brightness."""
 
 FEWEST_OBJECTS = 4
 """Objects from which the brightness relative to the base is compared."""
@@ -245,10 +250,10 @@ def choose_kinds(
 ) -> Choice:
     """Learn the histogram of kind and roughness by EM (Eq. M.21, M.23) and return the posterior of each object.
 
-    Which of two objects has the rougher base counts as an observation of their roughness. Where the prior of the predictions
-    states its errors, the metallic of the base is an observation, and its roughness takes the place of the histogram's. A metal
-    must agree with the brightness of its base at least as well as a dielectric does
-    (docs/method/fitting.md#selection-of-kind-and-roughness).
+    Which of two objects has the rougher base counts as an observation of their roughness, and a metal must agree with the
+    brightness of its base at least as well as a dielectric does. Where the prior of the predictions states its errors, the
+    roughness of the base takes the place of the histogram's, and the odds of metal are those of rooms with truth (Eq. M.56;
+    docs/method/fitting.md#selection-of-kind-and-roughness).
 
     Args:
         found: the evidence; counts: (O,) bool, objects that enter the histogram.
@@ -262,8 +267,8 @@ def choose_kinds(
     cost = found.cost.copy()
     scale = EVIDENCE_DISCOUNT * found.noise[:, None, None]
     everything = np.exp(np.maximum((cost.min((1, 2), keepdims=True) - cost) / scale, -700.0)) * _PRIOR_OF_KINDS
-    # An object whose best metal is too rough loses all its metals, not only the rough ones.
-    cost[ROUGHNESS_GRID[cost[:, 1].argmin(1)] > ROUGHEST_METAL, 1] = np.inf
+    if stated is None:  # an object whose best metal is too rough loses all its metals, not only the rough ones
+        cost[ROUGHNESS_GRID[cost[:, 1].argmin(1)] > ROUGHEST_METAL, 1] = np.inf
     cost[:, 1, ROUGHNESS_GRID > ROUGHEST_METAL] = np.inf
     if given is not None:
         cost = _within_given(cost, found.cost, given)
@@ -276,14 +281,17 @@ def choose_kinds(
     prior, brightness = flat, _log_brightness(found, mean_base[:, :3])
     # (O, R) likelihood of the base's roughness at each roughness of the grid; 1 = the base says nothing.
     of_base = np.ones((len(counts), len(ROUGHNESS_GRID)))
+    metal = None
     if stated is not None:
-        likelihood[:, 1] *= np.exp(stated.metal_log_odds(mean_base[:, 4]))[:, None]
         of_base = stated.roughness_prior(mean_base[:, 3], ROUGHNESS_GRID)
+        metal = _metal_log_odds(likelihood * of_base[:, None], brightness, counts, stated.metal_log_odds(mean_base[:, 4]))
 
     # -------- EM: posteriors of the objects, then the histogram they share (Eq. M.23) --------
     for _ in range(50):
         posterior = likelihood * prior * of_base[:, None]
-        if counts.sum() >= FEWEST_OBJECTS:
+        if metal is not None:
+            posterior = _with_metal_odds(posterior, metal, np.isfinite(cost).any(2))
+        elif counts.sum() >= FEWEST_OBJECTS:
             posterior *= _agreement_with_base(posterior, brightness, counts)[:, :, None]
         posterior /= posterior.sum((1, 2), keepdims=True)
         histogram = _smoothed(posterior[counts].sum(0)) + _PSEUDO_OBJECTS * flat * flat.size
@@ -365,6 +373,31 @@ def _likelihood_of_base(posterior: np.ndarray, roughness: np.ndarray, pixels: np
     scatter = max(float(np.sqrt(square / (count + _UNRELATED_OBJECTS))), _LEAST_BASE_SCATTER)
     likelihood = (1.0 + (away / scatter) ** 2 / DEGREES_OF_FREEDOM) ** (-0.5 * (DEGREES_OF_FREEDOM + 1.0))
     return likelihood / likelihood.max(1, keepdims=True)
+
+
+def _metal_log_odds(likelihood: np.ndarray, brightness: np.ndarray, counts: np.ndarray, stated: np.ndarray) -> np.ndarray:
+    """Logarithm of the odds of metal (O,), as they are in rooms with truth (Eq. M.56).
+
+    likelihood: (O, 3, R) of photographs and base, up to a factor; brightness: (O, 3, R) relative to the base; counts: (O,) objects
+    whose photographs tell something; stated: (O,) logarithm of the odds that the metallic of the base says.
+    """
+    total = np.maximum(likelihood.sum(2), 1e-300)
+    evidence = np.where(counts, np.log(total[:, 1]) - np.log(total[:, 0]), 0.0)
+    # Errors of light and geometry are large where they occur at all, so a hundred times the evidence is not a hundred times as sure.
+    of_photographs = np.sign(evidence) * np.log1p(np.abs(evidence))
+    brighter = np.where(counts, (likelihood[:, 1] * brightness[:, 1]).sum(1) / total[:, 1], 0.0)
+    constant, of_stated, of_evidence, of_brightness = _METAL_ODDS
+    return constant + of_stated * stated + of_evidence * of_photographs + of_brightness * np.clip(brighter, *_BRIGHTER)
+
+
+def _with_metal_odds(posterior: np.ndarray, log_odds: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+    """Posterior (O, 3, R), up to a factor, with the given logarithm of the odds of metal (O,) where both a metal and another of the
+    kinds `allowed` (O, 3) may be."""
+    own, others = posterior[:, 1].sum(1), posterior[:, ::2].sum((1, 2))
+    is_open = allowed[:, 1] & allowed[:, ::2].any(1) & (own > 0)
+    # Shares first: the sums may be as small as e^-700.
+    metal = posterior[:, 1] / np.where(is_open, own, 1.0)[:, None] * np.where(is_open, others * np.exp(log_odds), 1.0)[:, None]
+    return np.stack([posterior[:, 0], metal, posterior[:, 2]], 1)
 
 
 def _log_brightness(found: Profile, mean_base: np.ndarray) -> np.ndarray:

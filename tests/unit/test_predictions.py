@@ -53,25 +53,60 @@ def test_facts_survive_and_wrong_ones_are_refused(change):
         PredictionErrors.from_facts(ERRORS.facts() | change, "recipe")
 
 
-def kinds_of(metallic, evidence_for_metal, stated):
-    """Kind of objects that look alike but for the predicted metallic (O,) and the photographs' evidence (O,)."""
+def chosen(metallic, evidence_for_metal, stated, brighter=0.0, given=None, roughness=3):
+    """Choice for objects that look alike but for the predicted metallic (O,), the photographs' evidence (O,), and how much brighter
+    than the base a metal would be; metals have the roughness of a number of the grid."""
     objects = len(metallic)
     cost = np.full((objects, 3, len(ROUGHNESS_GRID)), np.inf)
-    cost[:, :2, 3] = 0.0
     cost[:, 0, 3] = evidence_for_metal
+    cost[:, 1, roughness] = 0.0
     base = np.full((objects, 5), 0.4)
     base[:, 4] = metallic
     affine = np.zeros((*cost.shape, 16))
     affine[..., [0, 5, 10]] = 1.0
+    affine[:, 1, :, :12] *= np.exp(np.broadcast_to(brighter, objects))[:, None, None]
     found = Profile(cost, affine, np.full(objects, 1.0 / EVIDENCE_DISCOUNT))
-    return choose_kinds(found, np.ones(objects, bool), base, np.full(objects, 100), None, stated).kind
+    return choose_kinds(found, np.ones(objects, bool), base, np.full(objects, 100), given, stated)
+
+
+def log_odds(choice):
+    dielectric, metal, as_predicted = choice.kinds.probability.T
+    np.testing.assert_allclose(as_predicted, 0.0, atol=1e-250)
+    return np.log(metal) - np.log(dielectric)
 
 
 def test_the_base_decides_between_metal_and_dielectric_where_photographs_do_not():
     """Evidence of e^3 for metal outweighs the rarity of metals (0.85 to 0.1), unless the prediction says otherwise."""
-    metallic, evidence = np.array([1e-3, 0.05, 0.6, 1e-3, 0.9]), np.array([3.0, 3.0, 3.0, 30.0, -30.0])
-    np.testing.assert_array_equal(kinds_of(metallic, evidence, None), [1, 1, 1, 1, 0])
-    np.testing.assert_array_equal(kinds_of(metallic, evidence, ERRORS), [0, 1, 1, 1, 0])
+    metallic, evidence = np.array([1e-3, 0.05, 0.6, 0.9]), np.array([3.0, 3.0, 3.0, -30.0])
+    np.testing.assert_array_equal(chosen(metallic, evidence, None).kind, [1, 1, 1, 0])
+    np.testing.assert_array_equal(chosen(metallic, evidence, ERRORS).kind, [0, 0, 1, 0])
+
+
+def test_odds_of_metal_are_those_of_rooms_with_truth():
+    """Each of the three witnesses alone, by hand (Eq. M.56): ln odds = c + 0.38 s + 0.7 sgn(e) ln(1 + |e|) + 1.22 x."""
+    metallic, evidence = np.array([0.5, 0.5, 0.9, 0.5, 0.5, 0.5]), np.array([0.0, 99.0, 0.0, -99.0, 0.0, 0.0])
+    odds = log_odds(chosen(metallic, evidence, ERRORS, brighter=np.array([0.0, 0.0, 0.0, 0.0, 0.5, 9.0])))
+    usual = -1.74 + 0.38 * 3.4
+    by_hand = [0.0, 0.7 * np.log(100.0), 0.38 * 1.1 * np.log(9.0), -0.7 * np.log(100.0), 0.61, 1.83]
+    np.testing.assert_allclose(odds - usual, by_hand, atol=1e-9)
+    # The odds of an object do not depend on what the others are.
+    np.testing.assert_allclose(log_odds(chosen(metallic[:1], evidence[:1], ERRORS)), odds[:1], atol=1e-9)
+
+
+def test_a_rough_metal_is_none_and_a_known_one_is_one():
+    some = np.array([0.9]), np.array([300.0])
+    assert chosen(*some, ERRORS).kind == [1]
+    assert chosen(*some, ERRORS, roughness=6).kind == [0]  # rougher than `ROUGHEST_METAL`
+    for metallic in (0.0, 1.0):
+        known = chosen(*some, ERRORS, given=np.array([[np.nan, metallic]]), roughness=6)
+        np.testing.assert_allclose(known.kinds.probability[0, 1], metallic, atol=1e-12)
+
+
+@given(st.lists(st.floats(0, 1), min_size=5, max_size=5), st.lists(st.floats(-1e12, 1e12), min_size=5, max_size=5), st.floats(-30, 9))
+def test_any_evidence_gives_probabilities(metallic, evidence, brighter):
+    probability = chosen(np.array(metallic), np.array(evidence), ERRORS, brighter).kinds.probability
+    assert (probability >= 0).all()
+    np.testing.assert_allclose(probability.sum(1), 1.0, rtol=1e-12)
 
 
 def test_roughness_follows_the_base_where_photographs_say_nothing():
@@ -110,6 +145,23 @@ def test_error_of_the_light_on_an_object_from_what_the_light_leaves_unexplained(
     assert [shared_light_error(misfit) for misfit in (0.0, -1e-4, 1e9)] == [0.03, 0.03, 0.6]
     assert all(shared_light_error(unknown) == SHARED_LIGHT_ERROR for unknown in (None, np.inf, np.nan))
     assert relative_error_of_base(np.array([0.3]))[0] == 1 and np.isfinite(relative_error_of_base(np.array([0.0, 9.0]))).all()
+
+
+def test_the_light_tells_the_level_of_a_metal_more_than_its_base_does():
+    """Twice as bright as the base says: the light on a dielectric is blamed, on a certain metal the base is, on a doubtful one less."""
+    base, shown = np.full((60, 3), 0.2), np.full((60, 3), 0.2)
+    shown[:3] *= 2.0
+    rest = np.full(60, 0.05), np.full(60, 0.05), np.full(60, 100.0)
+    metal = np.zeros(60)
+    metal[1:3] = 1.0, 0.55
+    levels = compare_levels(base, shown, *rest, stated=0.19, shared=0.25, metal=metal)
+    plain = compare_levels(base, shown, *rest, stated=0.19, shared=0.25)
+    dielectric, certain, doubtful = np.log(levels.light_gain[:3]) / np.log(2.0)
+    assert certain < 0.35 < doubtful < 0.75 and certain < dielectric
+    np.testing.assert_allclose(levels.light_gain[[0, *range(3, 60)]], plain.light_gain[[0, *range(3, 60)]], rtol=0.02)
+    # Where both errors are learnt, they are.
+    learnt = (compare_levels(base, shown, *rest, metal=found) for found in (metal, None))
+    assert len({levels.light_gain.tobytes() for levels in learnt}) == 1
 
 
 def test_an_error_that_base_and_light_share_is_claimed_nevertheless():
