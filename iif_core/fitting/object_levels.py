@@ -35,8 +35,8 @@ _PER_ROOT_MISFIT, _SHARED_LIGHT_ERRORS = 0.7, (0.03, 0.6)
 _OWN_SHARE = 0.8
 """Share of the stated error of the base that the light does not have too: only this part shows in a discrepancy."""
 _BASE_OF_METAL, _LIGHT_ON_METAL, _NO_METAL = 0.6, 0.3, 1.0
-"""Where the prior states its errors, those of a metal's base (a metal that reflects something dark looks like dark paint) and of the
-light on it as a whole; and of the light on what was wrongly taken for one."""
+"""Where the prior states its errors, those of a metal's base (a metal that reflects something dark looks like dark paint) and of
+the light on it as a whole; and of the light on what was wrongly taken for one."""
 _QUARTILES = 1.349
 """Distance of the quartiles of a normal distribution, in standard deviations."""
 _MIDDLE_ALBEDO = 0.3
@@ -261,8 +261,8 @@ def compare_levels(
         stated: error of the base for an albedo of 0.3 (`PredictionErrors.brightness`), and neither error is learnt; None = both
             are, by means of `scatter` and `smooth`.
         shared: error of the light on an object as a whole, where an error of the base is stated.
-        metal: (O,) probability that what is taken for a metal is one, 0 for everything else, where an error of the base is stated;
-            None = there is none.
+        metal: (O,) probability that what is taken for a metal is one, 0 for everything else, where an error of the base is
+            stated; None = there is none.
         base_tells_levels: False = both errors are what is usual, no discrepancy is divided, and the light keeps its whole error.
     """
     pixels = pixels if pixels.any() else np.ones(len(pixels))

@@ -138,6 +138,7 @@ class Kinds:
         brightness: (O, 3) logarithm of the brightness of the albedo fitted to each kind, over that of the chosen one.
         roughness, deviation: (O, 3) posterior mean and standard deviation given each kind.
         seen: (O,) 1 - (variance of the roughness given the chosen kind) / (the same without the photographs), at least 0.
+        witnesses: (O, 3) what speaks for a metal (`selection.metal_log_odds`); 0 where the prior does not state its errors.
     """
 
     probability: np.ndarray
@@ -145,11 +146,12 @@ class Kinds:
     roughness: np.ndarray
     deviation: np.ndarray
     seen: np.ndarray
+    witnesses: np.ndarray
 
     @classmethod
     def unknown(cls, n_objects: int) -> Kinds:
         """Return that nothing is known of any object."""
-        return cls(*np.zeros((4, n_objects, 3)), np.zeros(n_objects))
+        return cls(*np.zeros((4, n_objects, 3)), np.zeros(n_objects), np.zeros((n_objects, 3)))
 
     def among(self, members: np.ndarray, n_objects: int) -> Kinds:
         """Return the same for all objects, of which these are the `members`; nothing is known of the others."""

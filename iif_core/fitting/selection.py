@@ -34,9 +34,9 @@ _PRIOR_OF_KINDS = np.array([[0.85], [0.1], [0.05]])
 EVIDENCE_DISCOUNT = 20.0
 """Factor on the variance of a row in the evidence (Eq. M.21). The scatter between clusters shows what varies over an object, but
 not the errors of light and geometry that the whole object shares."""
-_METAL_ODDS = (-1.74, 0.38, 0.70, 1.22)
-"""Logarithm of the odds of metal where the prior states its errors (Eq. M.56): constant, and what counts of the odds that the base
-states, of the evidence of the photographs, and of the brightness that a metal would have relative to the base."""
+METAL_ODDS = (-1.74, 0.38, 0.70, 1.22)
+"""Logarithm of the odds of metal where the prior states its errors (Eq. M.56): constant, and what counts of the odds that the
+base states, of the evidence of the photographs, and of the brightness that a metal would have relative to the base."""
 _BRIGHTER = (-1.0, 1.5)
 """Limits of the logarithm of that brightness."""
 
@@ -281,15 +281,18 @@ def choose_kinds(
     prior, brightness = flat, _log_brightness(found, mean_base[:, :3])
     # (O, R) likelihood of the base's roughness at each roughness of the grid; 1 = the base says nothing.
     of_base = np.ones((len(counts), len(ROUGHNESS_GRID)))
-    metal = None
+    witnesses = np.zeros((len(counts), 3))
     if stated is not None:
         of_base = stated.roughness_prior(mean_base[:, 3], ROUGHNESS_GRID)
-        metal = _metal_log_odds(likelihood * of_base[:, None], brightness, counts, stated.metal_log_odds(mean_base[:, 4]))
+        witnesses = np.column_stack(
+            [stated.metal_log_odds(mean_base[:, 4]), _metal_against_dielectric(likelihood * of_base[:, None], brightness, counts)]
+        )
+    metal = metal_log_odds(witnesses)
 
     # -------- EM: posteriors of the objects, then the histogram they share (Eq. M.23) --------
     for _ in range(50):
         posterior = likelihood * prior * of_base[:, None]
-        if metal is not None:
+        if stated is not None:
             posterior = _with_metal_odds(posterior, metal, np.isfinite(cost).any(2))
         elif counts.sum() >= FEWEST_OBJECTS:
             posterior *= _agreement_with_base(posterior, brightness, counts)[:, :, None]
@@ -308,7 +311,7 @@ def choose_kinds(
     _, unseen = _moments(prior * of_base[:, None])
     log_ratio = (posterior * brightness).sum(2) / np.maximum(probability, 1e-300)
     informed = 1.0 - (deviation / np.maximum(unseen, 1e-6))[each, kind] ** 2
-    kinds = Kinds(probability, log_ratio - log_ratio[each, kind][:, None], mean, deviation, np.maximum(informed, 0.0))
+    kinds = Kinds(probability, log_ratio - log_ratio[each, kind][:, None], mean, deviation, np.maximum(informed, 0.0), witnesses)
     mean, deviation = mean[each, kind], deviation[each, kind]
     at = np.abs(ROUGHNESS_GRID[None] - mean[:, None]).argmin(1)
     level = float(histogram.sum(0) @ ROUGHNESS_GRID)
@@ -375,24 +378,40 @@ def _likelihood_of_base(posterior: np.ndarray, roughness: np.ndarray, pixels: np
     return likelihood / likelihood.max(1, keepdims=True)
 
 
-def _metal_log_odds(likelihood: np.ndarray, brightness: np.ndarray, counts: np.ndarray, stated: np.ndarray) -> np.ndarray:
-    """Logarithm of the odds of metal (O,), as they are in rooms with truth (Eq. M.56).
+def _metal_against_dielectric(likelihood: np.ndarray, brightness: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Logarithms (O, 2) of the evidence for a metal over that for a dielectric, and of the brightness that a metal would have
+    over that of the base; 0 for objects that do not count.
 
-    likelihood: (O, 3, R) of photographs and base, up to a factor; brightness: (O, 3, R) relative to the base; counts: (O,) objects
-    whose photographs tell something; stated: (O,) logarithm of the odds that the metallic of the base says.
+    likelihood: (O, 3, R) of photographs and base, up to a factor; brightness: (O, 3, R) relative to the base; counts: (O,).
     """
     total = np.maximum(likelihood.sum(2), 1e-300)
-    evidence = np.where(counts, np.log(total[:, 1]) - np.log(total[:, 0]), 0.0)
-    # Errors of light and geometry are large where they occur at all, so a hundred times the evidence is not a hundred times as sure.
-    of_photographs = np.sign(evidence) * np.log1p(np.abs(evidence))
-    brighter = np.where(counts, (likelihood[:, 1] * brightness[:, 1]).sum(1) / total[:, 1], 0.0)
-    constant, of_stated, of_evidence, of_brightness = _METAL_ODDS
-    return constant + of_stated * stated + of_evidence * of_photographs + of_brightness * np.clip(brighter, *_BRIGHTER)
+    evidence = np.log(total[:, 1]) - np.log(total[:, 0])
+    brighter = (likelihood[:, 1] * brightness[:, 1]).sum(1) / total[:, 1]
+    return np.where(counts[:, None], np.column_stack([evidence, brighter]), 0.0)
+
+
+def metal_log_odds(witnesses: np.ndarray, numbers: tuple[float, float, float, float] = METAL_ODDS) -> np.ndarray:
+    """Return the logarithm of the odds of metal (O,) (Eq. M.56).
+
+    Args:
+        witnesses: (O, 3) logarithms of the odds that the base states, of the evidence of the photographs for a metal over that
+            for a dielectric, and of the brightness of a metal over that of the base.
+        numbers: what they count, after a constant.
+    """
+    constant, *counts = numbers
+    return constant + metal_witnesses(witnesses) @ np.array(counts)
+
+
+def metal_witnesses(witnesses: np.ndarray) -> np.ndarray:
+    """Return the witnesses (O, 3) as they count. Errors of light and geometry are rare and then large, so a hundred times the
+    evidence is not a hundred times as sure."""
+    stated, evidence, brighter = np.asarray(witnesses, np.float64).T
+    return np.column_stack([stated, np.sign(evidence) * np.log1p(np.abs(evidence)), np.clip(brighter, *_BRIGHTER)])
 
 
 def _with_metal_odds(posterior: np.ndarray, log_odds: np.ndarray, allowed: np.ndarray) -> np.ndarray:
-    """Posterior (O, 3, R), up to a factor, with the given logarithm of the odds of metal (O,) where both a metal and another of the
-    kinds `allowed` (O, 3) may be."""
+    """Posterior (O, 3, R), up to a factor, with the given logarithm of the odds of metal (O,) where both a metal and another of
+    the kinds `allowed` (O, 3) may be."""
     own, others = posterior[:, 1].sum(1), posterior[:, ::2].sum((1, 2))
     is_open = allowed[:, 1] & allowed[:, ::2].any(1) & (own > 0)
     # Shares first: the sums may be as small as e^-700.

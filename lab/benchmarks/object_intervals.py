@@ -181,7 +181,8 @@ def rooms_of(table: Sequence[Mapping[str, str]]) -> list[Room]:
         def columns(*names: str, own: Sequence[Mapping[str, str]] = own) -> Array:
             return np.array([[float(row[name]) for name in names] for row in own])
 
-        kinds = Kinds(**{name: columns(*(f"{name}_{k}" for k in range(3))) for name in KINDS}, seen=columns("seen")[:, 0])
+        of_kinds = {name: columns(*(f"{name}_{k}" for k in range(3))) for name in KINDS}
+        kinds = Kinds(**of_kinds, seen=columns("seen")[:, 0], witnesses=np.zeros((len(own), 3)))
         truth = columns(*(f"true_{name}" for name in CHANNELS))
         level, room_error, *counts = columns("level", "room_error", "cells", "pixels").T
         rooms.append(Room(scene, columns(*CHANNELS), truth, level, float(room_error[0]), *counts, kinds))

@@ -31,7 +31,7 @@ def room(seed: int, scale: float = 1.0, objects: int = 200) -> measurement.Room:
     error = np.hypot(0.04, np.where(metal, TRUE.metal, TRUE.dielectric)) / stats.t.ppf(stats.norm.cdf(1), 4)
     roughness = truth[:, 3] + scale * error * rng.standard_t(4, objects)
     none = np.zeros((objects, 3))
-    kinds = Kinds(np.c_[~metal, metal, none[:, 0]].astype(float), none, none + 0.5, none + 0.04, np.ones(objects))
+    kinds = Kinds(np.c_[~metal, metal, none[:, 0]].astype(float), none, none + 0.5, none + 0.04, np.ones(objects), none)
     estimate = np.c_[np.clip(albedo, 0, 1), roughness, metal]
     truth[:, 4] = metal
     return measurement.Room(f"r{seed}", estimate, truth, level, 1e-3, np.full(objects, 100.0), pixels, kinds)

@@ -156,6 +156,7 @@ def rows():
         "pixels": np.array([0, 78]), "given": np.array(["roughness", ""], object), "kind_seen": np.array([0.0, 1.0]),
         "kind_probability": np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), "kind_brightness": np.zeros((2, 3)),
         "kind_roughness": np.full((2, 3), 0.6), "kind_deviation": np.full((2, 3), 0.1),
+        "kind_witnesses": np.zeros((2, 3)),
     }  # fmt: skip
     seen = {"object_id": np.arange(3), "pixels": np.array([70, 8, 0]), "views": np.array([4, 2, 0])}
     return object_rows(["=wall", 'so, "fa"', "lost"], np.array([0, 0, 1]), values, np.full((3, 5), 0.25), fit, 0.05, seen)
@@ -164,7 +165,7 @@ def rows():
 def test_objects_are_means_with_intervals():
     table, errors = rows(), MeasuredErrors.from_facts(measured()["errors"], "")
     assert table["base_colour_r"] == [0.3, 0.9, 0.25] and table["roughness"] == [0.6, 0.1, 0.25]  # the last has no cells
-    kinds = Kinds(np.eye(1, 3), np.zeros((1, 3)), np.full((1, 3), 0.6), np.full((1, 3), 0.1), np.ones(1))
+    kinds = Kinds(np.eye(1, 3), np.zeros((1, 3)), np.full((1, 3), 0.6), np.full((1, 3), 0.1), np.ones(1), np.zeros((1, 3)))
     low, high = AlbedoIntervals.of([[0.3, 0.4, 0.4]], [0.1], [78], 0.05, kinds, errors).ends(errors.albedo)
     for c, name in enumerate("rgb"):
         assert table[f"base_colour_{name}_low"][0] == pytest.approx(low[0, c], rel=1e-4), name

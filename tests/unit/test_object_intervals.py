@@ -30,7 +30,7 @@ Q4 = stats.t.ppf(0.975, 4) / stats.t.ppf(stats.norm.cdf(1), 4)
 
 def kinds(n=1, probability=(1.0, 0.0, 0.0), brightness=(0.0, 0.0, 0.0), roughness=(0.5, 0.0, 0.0), deviation=0.1, seen=1.0):
     rows = (np.tile(np.asarray(row, float), (n, 1)) for row in (probability, brightness, roughness, [deviation] * 3))
-    return Kinds(*rows, seen=np.full(n, float(seen)))
+    return Kinds(*rows, seen=np.full(n, float(seen)), witnesses=np.zeros((n, 3)))
 
 
 def albedo(value, level=0.1, pixels=1e12, room=0.0, errors=NOTHING, of=None, factor=1.0):
@@ -243,7 +243,9 @@ def test_roughness_is_claimed_until_its_interval_is_0_to_1(value, deviation):
 
 def test_metallic_excludes_what_is_rarer_than_one_in_twenty():
     probability = np.array([[0.96, 0.04, 0.0], [0.94, 0.06, 0.0], [0.04, 0.96, 0.0], [0.5, 0.01, 0.49], [0.0, 0.0, 0.0]])
-    own = MetallicIntervals.of([0.0, 0.0, 1.0, 0.3, 0.0], Kinds(probability, *[np.zeros((5, 3))] * 3, seen=np.ones(5)))
+    own = MetallicIntervals.of(
+        [0.0, 0.0, 1.0, 0.3, 0.0], Kinds(probability, *[np.zeros((5, 3))] * 3, seen=np.ones(5), witnesses=np.zeros((5, 3)))
+    )
     low, high = own.ends(1.0)
     assert low.tolist() == [0.0, 0.0, 1.0, 0.0, 0.0] and high.tolist() == [0.0, 1.0, 1.0, 1.0, 1.0]
     low, high = own.ends(1.2)  # odds of 24 to 1 become 14 to 1

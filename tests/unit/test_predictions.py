@@ -54,8 +54,8 @@ def test_facts_survive_and_wrong_ones_are_refused(change):
 
 
 def chosen(metallic, evidence_for_metal, stated, brighter=0.0, given=None, roughness=3):
-    """Choice for objects that look alike but for the predicted metallic (O,), the photographs' evidence (O,), and how much brighter
-    than the base a metal would be; metals have the roughness of a number of the grid."""
+    """Choice for objects that look alike but for the predicted metallic (O,), the photographs' evidence (O,), and how much
+    brighter than the base a metal would be; metals have the roughness of a number of the grid."""
     objects = len(metallic)
     cost = np.full((objects, 3, len(ROUGHNESS_GRID)), np.inf)
     cost[:, 0, 3] = evidence_for_metal
@@ -102,7 +102,9 @@ def test_a_rough_metal_is_none_and_a_known_one_is_one():
         np.testing.assert_allclose(known.kinds.probability[0, 1], metallic, atol=1e-12)
 
 
-@given(st.lists(st.floats(0, 1), min_size=5, max_size=5), st.lists(st.floats(-1e12, 1e12), min_size=5, max_size=5), st.floats(-30, 9))
+@given(
+    st.lists(st.floats(0, 1), min_size=5, max_size=5), st.lists(st.floats(-1e12, 1e12), min_size=5, max_size=5), st.floats(-30, 9)
+)
 def test_any_evidence_gives_probabilities(metallic, evidence, brighter):
     probability = chosen(np.array(metallic), np.array(evidence), ERRORS, brighter).kinds.probability
     assert (probability >= 0).all()
@@ -148,7 +150,7 @@ def test_error_of_the_light_on_an_object_from_what_the_light_leaves_unexplained(
 
 
 def test_the_light_tells_the_level_of_a_metal_more_than_its_base_does():
-    """Twice as bright as the base says: the light on a dielectric is blamed, on a certain metal the base is, on a doubtful one less."""
+    # Twice as bright as the base says: of a dielectric the light is blamed, of a certain metal the base, of a doubtful one less.
     base, shown = np.full((60, 3), 0.2), np.full((60, 3), 0.2)
     shown[:3] *= 2.0
     rest = np.full(60, 0.05), np.full(60, 0.05), np.full(60, 100.0)
