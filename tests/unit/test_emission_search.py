@@ -327,3 +327,14 @@ def test_search_ends():
 
     chosen, changes = search(frozenset({0}), lambda families: [Proposal(frozenset({max(families) + 1}))], worth)
     assert len(changes) == 4 and chosen == {4}
+
+
+def test_what_is_needed_is_what_others_cannot_explain():
+    room = _room(1.0)
+    needed = room.needed(frozenset({0, 2}))
+    assert set(needed) == {0, 2} and needed[2] > 0.3
+    alone, both = (room._look(frozenset(families))[0] for families in ([0], [0, 2]))
+    assert needed[2] == pytest.approx(np.log(alone / both))
+    # Unseen surface that a white one could match cannot be a lamp; neither set can then, and nothing is known.
+    impossible = _room(1.0, reflects=1e3).needed(frozenset({2, 3}))
+    assert impossible == {2: 0.0, 3: 0.0}

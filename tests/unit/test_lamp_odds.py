@@ -13,6 +13,7 @@ from iif_core.light.emission.odds import (
     OVERHEAD,
     SATURATED,
     UNLIKELY,
+    LampEvidence,
     LampOdds,
     ObjectLooks,
     heights,
@@ -142,3 +143,20 @@ def test_a_group_belongs_to_the_object_with_most_of_its_surface():
     scene = SimpleNamespace(object_id=np.array([2, 0, 0, 1, -1]), areas=np.array([1.0, 0.3, 0.3, 5.0, 1.0]))
     groups = SimpleNamespace(of_face=np.array([0, 0, 0, -1, 1]), size=3)
     assert emitters._objects(SimpleNamespace(scene=scene), groups).tolist() == [2, -1, -1]
+
+
+def test_probability_of_a_lamp_by_hand():
+    """A spot overhead that 10 % of the misfit need, a white page below it, unseen surface, and surface within the range."""
+    needed = np.array([np.log(1.1), 0.0, np.log(1.1), 0.0, np.inf, -np.inf])
+    own = LampEvidence(
+        is_likely=np.array([True, False, False, False, True, False]),
+        is_saturated=np.array([True, True, False, False, True, False]),
+        is_hidden=np.array([False, False, True, False, False, True]),
+        needed=needed,
+    )
+    odds = np.log(own.probability / (1.0 - own.probability))
+    slope = 4.3 * np.log(1.1)
+    np.testing.assert_allclose(odds, [1.3 + slope, -0.85, -1.3 + slope, -3.5, 1.3 + 4.3 * 0.3, -1.3 - 4.3 * 0.05])
+    np.testing.assert_array_equal(own.select(needed > 0).probability, own.probability[needed > 0])
+    # An unseen object is not saturated, whatever its family is.
+    assert replace(own, is_saturated=np.ones(6, bool)).probability[2] == own.probability[2]

@@ -135,6 +135,10 @@ def test_lamps_are_told_by_their_power():
     table |= {f"radiance_{c}": [2.0, 3.0, 9.0] for c in "rgb"} | {f"error_{c}": [0.1] * 3 for c in "rgb"}
     rows = emitter_rows({name: np.array(column) for name, column in {**table, "reason": [""] * 3}.items()})
     assert [(row["id"], row["share"]) for row in rows] == [(5, "75.0 %"), (4, "25.0 %"), (6, "–")]  # both sides of b shine
+    assert {row["probability"] for row in rows} == {"–"}  # light of another solver
+    table |= {"reason": [""] * 3, "probability": [0.932, 0.051, -1.0]}
+    told = {name: np.array(column) for name, column in table.items()}
+    assert [row["probability"] for row in emitter_rows(told)] == ["5 %", "93 %", "–"]
     assert emitter_note(True, 1.0) == emitter_note(False, 1.0)[: len(emitter_note(True, 1.0))] != emitter_note(False, 1.0)
     assert "1.5" in emitter_note(True, 1.5)
 

@@ -17,7 +17,7 @@ def emitter_rows(table: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
     kept, area = table["kept"].astype(bool), table["kind"] == "area"
     sides = np.where(table["side"] == 0, 2.0, 1.0)
     power = np.where(kept & area, table["area_m2"] * sides, 0) * radiance.sum(1)
-    rows = []
+    probability, rows = table.get("probability", np.full(len(power), -1.0)), []
     for i in np.argsort(-power, kind="stable"):
         peak = radiance[i].max()
         swatch = color.to_uint8(color.srgb_from_linear(radiance[i] / peak if peak > 0 else radiance[i]))
@@ -31,6 +31,7 @@ def emitter_rows(table: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
                 "radiance": ", ".join(significant(v) for v in radiance[i]),
                 "error": ", ".join(significant(v, 2) for v in error[i]),
                 "swatch": "#{:02x}{:02x}{:02x}".format(*swatch),
+                "probability": percent(probability[i], 0) if probability[i] >= 0 else "–",
                 "share": percent(power[i] / power.sum(), 1) if area[i] and power.sum() > 0 else "–",
                 "power": f"{power[i]:.6g}",
                 "brightness": f"{radiance[i].sum():.6g}",

@@ -11,12 +11,16 @@ from iif_core.camera.response import response_facts
 from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.find import FoundLight
 from iif_core.light.emission.groups import EmitterGroups
+from iif_core.light.emission.odds import LampEvidence
 from workflow.decisions import light as decisions
 from workflow.decisions import numerics
 from workflow.decisions.record import Decision
 from workflow.runtime.job import Job
 from workflow.scene.emission_views import gain_plan
 from workflow.scene.normal_form import CaptureReader
+
+UNKNOWN = -1.0
+"""Probability of emitters of which nothing tells whether they are lamps."""
 
 
 def emitter_columns(
@@ -29,10 +33,16 @@ def emitter_columns(
     reason: list[str],
     kind: list[str] | None = None,
     side: np.ndarray | None = None,
+    evidence: LampEvidence | None = None,
 ) -> dict[str, Any]:
     """Return the columns of emitters.parquet for n emitters: `faces`, `area` (m^2), `observations`, `kept`, `reason` and `side`
-    (n,), `radiance` and `error` (n, 3); `kind`: None = all are faces."""
+    (n,), `radiance` and `error` (n, 3); `kind`: None = all are faces; `evidence`: of the first of them, None = of none."""
     n = len(faces)
+    told = {"probability": np.full(n, UNKNOWN), "needed": np.zeros(n)}
+    told |= {name: np.zeros(n, bool) for name in ("is_likely", "is_saturated", "is_hidden")}
+    if evidence is not None:
+        for name, values in told.items():
+            values[: len(evidence.needed)] = getattr(evidence, name)
     return {
         "emitter_id": np.arange(n, dtype=np.int32),
         "kind": np.array(["area"] * n if kind is None else kind, dtype=str),
@@ -44,6 +54,7 @@ def emitter_columns(
         "observations": np.asarray(observations, np.int64),
         "kept": np.asarray(kept, bool),
         "reason": np.array(reason, dtype=str),
+        **told,
     }
 
 
@@ -113,6 +124,7 @@ def _table(light: FoundLight) -> dict[str, Any]:
         reason=[""] * (groups.size + outside) + light.reasons,
         kind=["area"] * groups.size + ["environment"] * outside + ["area"] * out,
         side=np.array([*sides[0], *[0] * outside, *sides[1]]),
+        evidence=light.evidence,
     )
 
 
@@ -143,6 +155,11 @@ def _write_facts(
     if level_raised > 0:
         raised = f"light raised {np.exp(level_raised):.2f} times so that albedos are at most 1"
         notes.append(f"{raised}; the error of its level does not contain that")
+    doubtful = light.evidence.probability < 0.5 if light.evidence else np.zeros(0, bool)
+    if doubtful.any():
+        area = f"{found.groups.area[doubtful].sum():.2g} m^2"
+        what = "more likely surface that light falls on or passes through than lamps"
+        notes.append(f"{doubtful.sum()} of {kept} emitters ({area}) are {what}")
     found_emitters = decisions.emitters(kept, candidates - kept, candidates)
     plan = [*plan, *gain_plan(capture, photos.gains), found_emitters]
     active_set = {"rounds": solution.iterations, "converged": solution.converged, "violated": solution.violated}

@@ -24,7 +24,7 @@ from iif_core.light.emission.environment import Sky, sky_prior
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, BaseAlbedo, GainOptions, ObjectGains
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.hidden import with_hidden_surface
-from iif_core.light.emission.odds import LampOdds, ObjectLooks
+from iif_core.light.emission.odds import LampEvidence, LampOdds, ObjectLooks
 from iif_core.light.emission.photographs import SEEDS, Photographs, choose_rows, radiance_cache
 from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import (
@@ -172,13 +172,14 @@ def search_emitters(
     hits: np.ndarray,
     looks: ObjectLooks,
     odds: LampOdds,
-) -> tuple[Traced, np.ndarray, list[str]]:
+) -> tuple[Traced, np.ndarray, list[str], LampEvidence]:
     """Find whether other emitters explain the photographs better than those that the trial kept: with objects that no camera
     sees, with groups that were dropped although they may shine, or without some.
 
     pruned: of the trial, for all `groups`; certain: brightness relative to a white surface from which a group shines for certain;
     hits: (F,) rays from visible surface that meet each face; looks, odds: of the objects.
-    Returns the problem of the emitters, which of `groups` are among them, and a description of what was changed.
+    Returns the problem of the emitters, which of `groups` are among them, a description of what was changed, and what speaks for
+    each of the emitters.
     """
     # Groups were dropped one after the other; of some the light was given to others, and they may be needed after all.
     offered = np.flatnonzero(pruned.may_shine(certain, photos.options.prune)[: groups.size])
@@ -228,9 +229,16 @@ def search_emitters(
         turn = "falls" if new < old else "grows, less than what is known of lamps and of white surface outweighs,"
         told.append(f"{' and '.join(what)}: the misfit of the light {turn} from {old:.4f} to {new:.4f}")
         before = after
-    emitters, shines = every.select(np.isin(family, [*chosen])), np.zeros(all_groups, bool)
-    shines[offered] = np.isin(family[: groups.size], [*chosen])
-    return traced(photos, unseen, emitters, sky, threshold), shines, told
+    is_chosen, shines = np.isin(family, [*chosen]), np.zeros(all_groups, bool)
+    shines[offered] = is_chosen[: groups.size]
+    own, needed = family[is_chosen].tolist(), look.needed(chosen)
+    evidence = LampEvidence(
+        is_likely=np.append(odds.is_likely, False)[owner[is_chosen]],
+        is_saturated=np.array([look.is_saturated(f) for f in own], bool),
+        is_hidden=every.is_hidden[is_chosen],
+        needed=np.array([needed[f] for f in own], np.float64),
+    )
+    return traced(photos, unseen, every.select(is_chosen), sky, threshold), shines, told, evidence
 
 
 def solve_with_saturated_surface(

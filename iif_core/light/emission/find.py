@@ -19,7 +19,7 @@ from iif_core.light.emission.emitters import (
 )
 from iif_core.light.emission.environment import Sky, SkySums
 from iif_core.light.emission.groups import EmitterGroups, GroupingOptions, group_emitters
-from iif_core.light.emission.odds import LampOdds, ObjectLooks
+from iif_core.light.emission.odds import LampEvidence, LampOdds, ObjectLooks
 from iif_core.light.emission.photographs import (
     Photographs,
     escaping_light,
@@ -61,6 +61,7 @@ class FoundLight:
     Attributes:
         photos: with that assumption; look: the first look at them.
         found: the problem; solution: of it.
+        evidence: what speaks for each of its groups; None = photographs without a largest value, of which no room told the odds.
         left_out, reasons: candidate groups that turned out to reflect, and why.
         gain: (n_objects, 3) of the albedos.
         outside: the sky, None = none; sun: what speaks for one in it.
@@ -71,6 +72,7 @@ class FoundLight:
     photos: Photographs
     look: FirstLook
     found: Traced
+    evidence: LampEvidence | None
     solution: EmissionSolution
     left_out: EmitterGroups
     reasons: list[str]
@@ -159,7 +161,8 @@ def find_light(photos: Photographs, look: FirstLook, environment: bool, is_open:
     unseen = photos.tracer.repainted(scene.with_gains(gain))
     reasons = np.array(pruned.reason[: groups.size], dtype=object)
     hits = np.bincount(look.met[look.met >= 0], minlength=len(scene.faces))
-    found, shines, changes = search_emitters(photos, unseen, groups, pruned, certain, outside, threshold, hits, looks, odds)
+    search = photos, unseen, groups, pruned, certain, outside, threshold, hits, looks, odds
+    found, shines, changes, evidence = search_emitters(*search)
     for change in changes:
         photos.log.say(f"emitters: {change}")
     notes.extend(changes)
@@ -172,13 +175,14 @@ def find_light(photos: Photographs, look: FirstLook, environment: bool, is_open:
         photos.log.say(f"{weak.sum()} groups radiate no more than their error allows, and are taken out")
         visible = np.flatnonzero(shines)
         reasons[visible[weak[: len(visible)]]] = f"its radiance is within {SIGNIFICANT:.0f} standard errors of zero"
-        found = traced(photos, unseen, found.groups.select(~weak), outside, threshold)
+        found, evidence = traced(photos, unseen, found.groups.select(~weak), outside, threshold), evidence.select(~weak)
         found, solution = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
     gain = reliable(found.gains) if len(found.prior.initial) else gain  # without emitters those of the trial stay
     return FoundLight(
         photos=photos,
         look=look,
         found=found,
+        evidence=None if photos.sensor.is_hdr else evidence,
         solution=solution,
         left_out=groups.select(reasons != ""),
         reasons=[reason for reason in reasons if reason],

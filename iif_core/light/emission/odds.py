@@ -22,6 +22,11 @@ LIKELY, UNLIKELY = 9.0, 1.0 / 17.0
 sees and that is not overhead."""
 WORTH = 15.0
 """What a fall of the logarithm of the misfit by 1 is worth, as the logarithm of odds."""
+PROBABILITY = (-3.5, 2.15, 2.65, 2.2, 4.3)
+"""Logarithm of the odds that what was found to shine is a lamp: constant, and what counts that it is likely, saturated,
+seen by no camera, and needed."""
+_NEEDED = (-0.05, 0.3)
+"""Limits of the logarithm of the growth of the misfit without it."""
 _STEP_OFF = 0.01
 """Metres below the highest and the lowest point of an object at which its vertical rays start. Many lamps are flush with a
 ceiling, so the ray upwards starts inside the object, and passes it."""
@@ -147,3 +152,30 @@ class LampOdds:
     def weight(self) -> np.ndarray:
         """(O,) factor on the misfit of light in which the object shines, odds^(-1 / WORTH)."""
         return self.odds ** (-1.0 / WORTH)
+
+
+@dataclass(frozen=True)
+class LampEvidence:
+    """What speaks for each of G groups of emitters to be a lamp, and not surface that light falls on or passes through.
+
+    Attributes:
+        is_likely: (G,) bool, of an object that hangs overhead and is saturated; is_saturated: (G,) bool, most of what is seen of
+            its family is; is_hidden: (G,) bool, no camera sees it.
+        needed: (G,) logarithm by which the misfit (Eq. L.40) grows without its family, in the first look at all candidates.
+    """
+
+    is_likely: np.ndarray
+    is_saturated: np.ndarray
+    is_hidden: np.ndarray
+    needed: np.ndarray
+
+    def select(self, keep: np.ndarray) -> LampEvidence:
+        """Return the same of some groups."""
+        return LampEvidence(*(values[keep] for values in (self.is_likely, self.is_saturated, self.is_hidden, self.needed)))
+
+    @property
+    def probability(self) -> np.ndarray:
+        """(G,) that it is a lamp, as often as in rooms with truth (docs/method/light.md#probability-of-a-lamp)."""
+        seen = self.is_saturated & ~self.is_hidden
+        columns = [np.ones(len(self.needed)), self.is_likely, seen, self.is_hidden, np.clip(self.needed, *_NEEDED)]
+        return 1.0 / (1.0 + np.exp(-(np.column_stack(columns) @ np.array(PROBABILITY))))

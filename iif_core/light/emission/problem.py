@@ -264,7 +264,7 @@ def expected_radiance(pixels: EmissionPixels, seen: np.ndarray) -> np.ndarray:
     own = pixels.group >= 0
     count = np.bincount(pixels.group[own], minlength=len(seen))
     share = np.bincount(pixels.group[own], pixels.own_share[own], len(seen)) / np.maximum(count, 1)
-    return seen / np.sqrt(np.where(count > 0, share, 1.0))[:, None]
+    return seen / np.sqrt(np.where(share > 0, share, 1.0))[:, None]
 
 
 def white_surface(pixels: EmissionPixels, seen: np.ndarray, white: TracedTransport) -> WhiteSurface:

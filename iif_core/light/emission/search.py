@@ -30,6 +30,7 @@ _ADDED, _SWAPPED = 3, 2  # families that are tried in addition to the others, an
 _MISSED = 1.5  # growth of the misfit without a family from which nothing else can take its place
 _CONFIRMED = 2  # proposals that are traced
 _MAX_CHANGES = 4
+_MISFITS = 1e-12, 1e12  # beyond which misfits are alike
 _DARKEST = 0.02  # albedo by which what surface reflects is divided
 QUICK = GainOptions(rounds=4)
 """Gains of objects while emitters are compared."""
@@ -119,7 +120,7 @@ class Candidates:
                 always |= instead
             # Fewer families are worth a trace of their own if they explain nearly as much. How bright saturated surface is that
             # only reflects is not known before that trace.
-            look = _MISSED if self._is_saturated(out) else 1.0 + PROMISING
+            look = _MISSED if self.is_saturated(out) else 1.0 + PROMISING
             # Of a likely lamp, saturated, the excess is a lower bound and speaks for nothing.
             reflects = bool(rest) and self.weights[out] >= 1.0 and self._excess(out, white) < 1.0
             largest[rest] = look, _MISSED if reflects else 1.0 if out in doubtful else 1.0 - STEP
@@ -132,6 +133,13 @@ class Candidates:
         present = self.weight(chosen) * misfit
         worth = (f for f in order if f in always or self.weight(f) * found[f] <= growth[f][0] * present)
         return [Proposal(f, growth[f][1], f in always, f & chosen not in impossible) for f in worth]
+
+    def needed(self, chosen: Families) -> dict[int, float]:
+        """Return by how much the logarithm of the misfit grows without each of the `chosen` families; large if what is left
+        cannot be, 0 if neither can."""
+        sets = [chosen, *(chosen - {f} for f in sorted(chosen))]
+        present, *without = (np.log(np.clip(self._look(families)[0], *_MISFITS)) for families in sets)
+        return {f: float(value - present) for f, value in zip(sorted(chosen), without, strict=True)}
 
     def _look(self, chosen: Families) -> tuple[float, EmissionProblem, np.ndarray]:
         """Misfit of the families; the problem with all columns, scaled by the gains, in which their light is cached; and (n, 3)
@@ -168,7 +176,7 @@ class Candidates:
         seen = bool(np.isin(self.of_group, np.flatnonzero(self.family == family)).any())
         return seen and self._excess(family, white) >= self.certain
 
-    def _is_saturated(self, family: int) -> bool:
+    def is_saturated(self, family: int) -> bool:
         """Most of what was seen of a family is a lower bound."""
         own = np.isin(self.of_group, np.flatnonzero(self.family == family))
         return bool(own.any()) and bool(self.reflecting.rows.lower_bound[own].any(1).mean() > 0.5)
