@@ -174,8 +174,13 @@ class LampEvidence:
         return LampEvidence(*(values[keep] for values in (self.is_likely, self.is_saturated, self.is_hidden, self.needed)))
 
     @property
+    def columns(self) -> np.ndarray:
+        """(G, 4) what `PROBABILITY` counts, after its constant."""
+        seen = self.is_saturated & ~self.is_hidden
+        return np.column_stack([self.is_likely, seen, self.is_hidden, np.clip(self.needed, *_NEEDED)]).astype(np.float64)
+
+    @property
     def probability(self) -> np.ndarray:
         """(G,) that it is a lamp, as often as in rooms with truth (docs/method/light.md#probability-of-a-lamp)."""
-        seen = self.is_saturated & ~self.is_hidden
-        columns = [np.ones(len(self.needed)), self.is_likely, seen, self.is_hidden, np.clip(self.needed, *_NEEDED)]
-        return 1.0 / (1.0 + np.exp(-(np.column_stack(columns) @ np.array(PROBABILITY))))
+        constant, *counts = PROBABILITY
+        return 1.0 / (1.0 + np.exp(-(constant + self.columns @ np.array(counts))))
