@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iif_core.fitting.pixels import Pixels, evaluate_clusters
-from iif_core.fitting.problem import FitOptions
+from iif_core.fitting.problem import SHARED_LIGHT_ERROR, FitOptions
 from iif_core.fitting.tone import Tone
 from iif_core.numerics.color import srgb_from_linear
 from iif_core.reflectance.material import BIASES, NUMBERS
@@ -27,11 +27,8 @@ _BASE_FACTOR, _BASE_FACTORS, _BASE_FACTOR_WIDTH = 1.4, np.geomspace(0.3, 6.0, 15
 is sought; width (of the logarithm) of its prior."""
 _LIGHT_FACTORS, _LIGHT_FACTOR, _LIGHT_FACTOR_WIDTH = np.geomspace(0.5, 4.0, 13), 1.5, 0.35
 """The same for the factor between the error that all pixels of an object share and its smooth part within the object."""
-SHARED_LIGHT_ERROR = 0.12
-"""Error of the light that all pixels of an object share, as a logarithm, and that no variation within the object shows. It is
-added where the prior states its errors."""
 _PER_ROOT_MISFIT, _SHARED_LIGHT_ERRORS = 0.7, (0.03, 0.6)
-"""The same for a root mean square of 1 of what the light leaves unexplained; its limits."""
+"""`SHARED_LIGHT_ERROR` for a root mean square of 1 of what the light leaves unexplained; its limits."""
 _OWN_SHARE = 0.8
 """Share of the stated error of the base that the light does not have too: only this part shows in a discrepancy."""
 _BASE_OF_METAL, _LIGHT_ON_METAL, _NO_METAL = 0.6, 0.3, 1.0

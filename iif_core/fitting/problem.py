@@ -15,6 +15,10 @@ from iif_core.errors import InputError
 from iif_core.fitting.predictions import PredictionErrors
 from iif_core.numerics.rows import Rows
 
+SHARED_LIGHT_ERROR = 0.12
+"""Error of the light that all pixels of an object share, as a logarithm, and that no variation within the object shows, where the
+misfit of the light is not known. It is added where the prior states its errors."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class FitProblem(Rows):
@@ -123,7 +127,7 @@ class FitOptions:
     metallic_prior: float = 0.25
     base_tells_levels: bool = True
     prediction_errors: PredictionErrors | None = None
-    light_error: float = 0.12
+    light_error: float = SHARED_LIGHT_ERROR
     texture_sigma: float = 2.0 / 255.0
     brightest: float = 1.25
     threads: int = 1

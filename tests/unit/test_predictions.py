@@ -10,9 +10,9 @@ from iif_core.camera.response import response
 from iif_core.fitting import object_levels
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import Gauge, apply_gauge
-from iif_core.fitting.object_levels import SHARED_LIGHT_ERROR, compare_levels, relative_error_of_base, shared_light_error
+from iif_core.fitting.object_levels import compare_levels, relative_error_of_base, shared_light_error
 from iif_core.fitting.predictions import PredictionErrors
-from iif_core.fitting.problem import FitOptions
+from iif_core.fitting.problem import SHARED_LIGHT_ERROR, FitOptions
 from iif_core.fitting.selection import EVIDENCE_DISCOUNT, ROUGHNESS_GRID, Profile, choose_kinds
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
 from tests.errors import refused
