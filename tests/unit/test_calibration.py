@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from iif_core.camera.calibration.choice import CANDIDATES, calibrate_response, candidates
+from iif_core.camera.calibration.choice import CANDIDATES, calibrate_response, candidates, power_of_exposures
 from iif_core.camera.overlap import PatchRows, join_rows, no_rows, patch_rows
 from iif_core.camera.response import response
 from lab.simulated.photographs import response_curve
@@ -189,6 +189,68 @@ def test_unknown_exposures_give_the_curve_up_to_a_power(truth, limit):
     assert known.gauge == "" and (known.exposure == exposure).all()
     error = 100 * np.sqrt(np.mean((out.response(X**power) - truth(X)) ** 2, 0)).max()
     assert error < limit
+
+
+@pytest.mark.parametrize("power", [0.8, 1.25])
+@pytest.mark.parametrize("families", [CANDIDATES, ("ggcm",)], ids=["all", "one"])
+def test_stated_exposures_tell_the_power(power, families):
+    """The camera's curve is sRGB of a power of the radiance, which photographs alone take for sRGB. Files state exposures within
+    5 %."""
+    rng, srgb = np.random.default_rng(7), response("srgb")
+    rows, exposure = _rows(rng, lambda x: srgb(x**power))
+    stated = 3e-4 * exposure * np.exp(0.05 * rng.standard_normal(8))
+    without, out = (calibrate_response(rows, np.ones(8), families, given=False, stated=said) for said in (None, stated))
+    slopes = [np.polyfit(np.log(exposure), np.log(found.exposure), 1)[0] for found in (without, out)]
+    assert abs(np.log(slopes[0] / power)) < 0.12 and abs(np.log(slopes[1])) < 0.05
+    # The curve has the power that goes with them.
+    seen = srgb(X**power)
+    inside = (seen[:, 1] > 0.05) & (seen[:, 1] < 0.95)
+    logs = np.log(out.response.inverse(seen[inside]))[:, 1]
+    assert np.polyfit(np.log(X[inside, 1]), logs, 1)[0] == pytest.approx(1.0, abs=0.06)
+    assert "state" in out.gauge and "state" not in without.gauge
+
+
+def test_stated_exposures_tell_the_power_of_a_curve_that_is_not_known():
+    """Too few rows for a curve: what is taken as sRGB is taken as sRGB of a power."""
+    srgb = response("srgb")
+    rows, exposure = _rows(np.random.default_rng(8), lambda x: srgb(x**1.2), n_patches=20)
+    plain, out = (calibrate_response(rows, np.ones(8), given=False, stated=said) for said in (None, exposure))
+    slopes = [np.polyfit(np.log(exposure), np.log(found.exposure), 1)[0] for found in (plain, out)]
+    assert abs(slopes[0] - 1.2) < 0.06 and abs(slopes[1] - 1.0) < 0.04
+    assert (plain.response.family, out.response.family) == ("srgb", "sampled") and "power 1.2" in out.reason
+    assert np.abs(out.response(X) - srgb(X**1.2)).max() < 0.02
+    assert not out.rows and "state" in out.gauge and not plain.gauge
+    np.testing.assert_allclose(out.response.inverse(out.response(X)), X, atol=1e-4)
+
+
+def test_power_of_exposures():
+    stated = np.array([0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4])
+    slope, error = power_of_exposures(5.0 * stated**1.2, stated)
+    assert slope == pytest.approx(1.2) and error < 1e-5
+    rng = np.random.default_rng(0)
+    draws = np.array([power_of_exposures(stated**0.9 * np.exp(0.1 * rng.standard_normal(7)), stated) for _ in range(400)])
+    away = (draws[:, 0] - 0.9) / draws[:, 1]
+    assert abs(draws[:, 0].mean() - 0.9) < 0.01 and 0.8 < np.std(away) < 1.5
+    merged = stated.copy()
+    merged[2] *= 8.0  # the file of one photograph states another exposure
+    assert abs(power_of_exposures(stated**1.1, merged)[0] - 1.1) < 0.08
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        np.full(6, np.nan),
+        np.array([1.0, 2.0, 4.0, np.nan, np.nan, np.nan]),
+        np.ones(6),
+        np.array([0.0, -1.0, np.inf, 1.0, 2.0, 4.0]),
+        np.array([32.0, 16.0, 8.0, 4.0, 2.0, 1.0]),
+        np.array([1.0, 1.01, 1.02, 1.03, 1.04, 1.05]),
+    ],
+    ids=["none", "three", "the same", "three of use", "of other photographs", "no difference"],
+)
+def test_what_tells_no_power_changes_nothing(stated):
+    found = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0])
+    assert power_of_exposures(found, stated) == (1.0, np.inf)
 
 
 def test_unknown_exposures_without_overlap_stay_what_they_were():

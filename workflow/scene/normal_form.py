@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -177,6 +177,14 @@ class CaptureReader:
     def exposures(self) -> np.ndarray:
         """Return the exposures (views,) in the order of the views."""
         return np.array([view.exposure for view in self.views], np.float64)
+
+    def stated_exposures(self, views: Sequence[View] | None = None) -> np.ndarray | None:
+        """Return the exposures (views,) that the files of the photographs state, up to one factor, NaN = none; of all views, or
+        of some. None: no file states one."""
+        stated = self.facts.get("stated_exposure") or {}
+        if not stated:
+            return None
+        return np.array([stated.get(view.name, np.nan) for view in (self.views if views is None else views)], np.float64)
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Return vertices (n, 3) float32 in metres and faces (m, 3) int32."""

@@ -312,12 +312,21 @@ def _write(
         "registration": posed.facts,
         "plan": [*posed.plan, *decided],
         "exposure_estimated": task.settings.exposure == "estimate",
+        "stated_exposure": _stated(task, posed.frames),
         **({"held_out": held} if held else {}),
     }
     has_truth = any(frame.truth for frame in posed.frames)
     writer.finish(task.source.kind, task.settings.dynamic_range, has_truth, said, task.inputs.response, facts)
     for note in said:
         job.log.info("%s", note)
+
+
+def _stated(task: _Task, frames: Sequence[Frame]) -> dict[str, float]:
+    """Exposures that the files of photographs through a response state, by the names of the views."""
+    if not task.encoded:
+        return {}
+    stated = {frame.name: images.header(frame.image).exposure for frame in frames}
+    return {name: exposure for name, exposure in stated.items() if exposure is not None}
 
 
 # ------------------------------------------------------------------------------------------------------------- alignment

@@ -77,7 +77,8 @@ def _photographs(job: Job, capture: CaptureReader, notes: list[str]) -> tuple[Ph
     if not isinstance(setting, str) and not capture.is_hdr:
         measured = read_response_file(Path(setting.file)), f"measured: {setting.file}"
     families = () if measured else candidates(setting, capture.facts["dynamic_range"])
-    photos, camera = calibrated(photos, families, measured, not capture.facts.get("exposure_estimated", False))
+    given = not capture.facts.get("exposure_estimated", False)
+    photos, camera = calibrated(photos, families, measured, given, capture.stated_exposures())
     notes.extend([camera.gauge] if camera.gauge else [])
     return photos, camera
 

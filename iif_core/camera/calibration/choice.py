@@ -19,7 +19,7 @@ from iif_core.camera.calibration.rows import (
 )
 from iif_core.camera.gains import CameraGains, GainRows, choose_gains, estimate
 from iif_core.camera.overlap import PatchRows
-from iif_core.camera.response import SATURATION, START, Response, response
+from iif_core.camera.response import SATURATION, START, Response, response, sampled_response
 
 CANDIDATES = ("srgb", "gamma", "ggcm", "spline")
 """Families that `auto` compares, smallest first."""
@@ -27,6 +27,14 @@ GAUGE = (
     "exposures were found together with the response: any power p of the exposures goes with f(x^(1 / p)) and fits as well;"
     " the power is the one of a curve near sRGB"
 )
+STATED = "exposures were found together with the response; their power is that of the exposures that the photographs' files state"
+USUAL_POWER = 0.1
+"""Standard deviation over cameras of the power that is left open, as found near sRGB."""
+_SURE_POWER = 0.05  # error of a power from stated exposures up to which it is said to be theirs
+_FEWEST_STATED = 4  # photographs that state an exposure
+_POWERS = 0.5, 2.0  # that a camera may have
+_SAMPLES = 1024  # of a curve that is a power of another
+_ROUNDS = 10  # of the robust line through stated and found exposures
 _SIGNIFICANT = 2.0  # standard errors
 _MIN_ROWS = 200  # to fit a curve
 _SIGMA = 1.0  # standard deviation of a parameter around its start
@@ -88,6 +96,7 @@ def calibrate_response(
     families: Sequence[str] = CANDIDATES,
     saturation: float = SATURATION,
     given: bool = True,
+    stated: np.ndarray | None = None,
 ) -> CalibratedResponse:
     """Fit all families and choose the smallest one that no other beats significantly (Eq. C.24).
 
@@ -97,6 +106,8 @@ def calibrate_response(
         families: candidates, smallest first. Families without parameters are compared as they are.
         saturation: sensor values from here on are bounds.
         given: exposures are known; otherwise they are estimated together with each candidate.
+        stated: (V,) exposures that the files of the photographs state, up to one factor, NaN = none; they tell the power of
+            exposures that are not given (docs/method/camera.md#stated-exposures). None: no file states one.
 
     Returns:
         The chosen curve; the start of the first family if the data are insufficient.
@@ -107,26 +118,31 @@ def calibrate_response(
         return given_response(start, reason, exposure)
     gains = CameraGains.plain(exposure)
     if not given:
-        gains = _gains(rows, response(families[0]), gains)
+        gains = _gains(rows, response(families[0]), gains, stated=stated)
     channels = [channel_rows(rows, c, gains, saturation) for c in range(3)]
     enough = [c for c in range(3) if len(channels[c].cell) >= _MIN_ROWS]
     stops = max(channel.stops for channel in channels)
     if not enough:
-        gains = gains if given else _gains(rows, response(families[0]), CameraGains.plain(exposure), choose=True)
-        return _unknown(families[0], stops, max(len(c.cell) for c in channels), gains, given)
+        most, plain = max(len(c.cell) for c in channels), CameraGains.plain(exposure)
+        if given:
+            return _unknown(families[0], stops, most, gains, given)
+        start = response(families[0])
+        power = _believed_power(_gains(rows, start, plain, choose=True), stated)
+        found = _unknown(families[0], stops, most, _gains(rows, start, plain, choose=True, stated=stated), given)
+        return found if power == 1.0 else _of_power(found, power)
     common = concatenate_channels([channel_rows(rows, c, gains, saturation, MAX_ROWS // len(enough)) for c in enough])
     if not given:
         # The terms of the gains are chosen under the richest curve, fitted with one gain per view: under a wrong curve,
         # channels of different brightness seem to need gains of their own.
         rich = _fit(families[-1], common, channels, enough).response
-        gains = _gains(rows, rich, gains, choose=True)
+        gains = _gains(rows, rich, gains, choose=True, stated=stated)
         logs = log_factor(rows, gains)
         common, channels = common.exposed(logs), [channel.exposed(logs) for channel in channels]
     fits, found = [], []
     for family in families:
         fit, views = _fit(family, common, channels, enough), gains
         if not given:  # the gains under this curve, and the curve under these gains
-            views = _gains(rows, fit.response, gains)
+            views = _gains(rows, fit.response, gains, stated=stated)
             logs = log_factor(rows, views)
             fit = _fit(family, common.exposed(logs), [channel.exposed(logs) for channel in channels], enough)
         fits.append(fit)
@@ -147,7 +163,7 @@ def calibrate_response(
         table,
         _because(table, chosen, best, used, stops),
         views.exposure,
-        "" if given else GAUGE,
+        "" if given else STATED if _power(views, stated)[1] <= _SURE_POWER else GAUGE,
         None if given else views,
     )
 
@@ -183,11 +199,14 @@ def gain_rows(rows: PatchRows, curve: Response) -> GainRows:
     return GainRows(rows.patch.astype(np.int64), rows.view, values, radius2, rows.block)
 
 
-def _gains(rows: PatchRows, curve: Response, start: CameraGains, choose: bool = False) -> CameraGains:
+def _gains(
+    rows: PatchRows, curve: Response, start: CameraGains, choose: bool = False, stated: np.ndarray | None = None
+) -> CameraGains:
     """Gains under a curve, scaled to the mean exposure of `start`.
 
     With `choose`, the terms of the model that held-out surface supports; otherwise those that `start` was found to need, or
-    exposure and vignetting if it has no evidence. The undetermined power is one for all channels (Eq. C.28).
+    exposure and vignetting if it has no evidence. The undetermined power is one for all channels (Eq. C.28), that of the `stated`
+    exposures as far as these tell it.
     """
     linear, n_views = gain_rows(rows, curve).thinned(), len(start.gain)
     if choose:
@@ -196,9 +215,57 @@ def _gains(rows: PatchRows, curve: Response, start: CameraGains, choose: bool = 
         terms = {name: entry.included for name, entry in start.evidence.items()} or {"white_balance": False}
         found = replace(estimate(linear, n_views, **terms), evidence=start.evidence)
     found = replace(found, gain=_without_powers(found.gain, found.estimated))
+    power = _believed_power(found, stated)
+    found = replace(found, gain=np.where(found.estimated[:, None], found.gain ** (1.0 / power), found.gain))
     known = start.exposure[np.isfinite(start.exposure) & (start.exposure > 0)]
     mean = float(np.exp(np.mean(np.log(known)))) if len(known) else 1.0
     return replace(found, gain=found.gain * mean)
+
+
+def _power(found: CameraGains, stated: np.ndarray | None) -> tuple[float, float]:
+    """Power of the found over the stated exposures, and its standard error; (1, infinite) if too few are stated."""
+    if stated is None:
+        return 1.0, np.inf
+    return power_of_exposures(found.exposure, np.where(found.estimated, stated, np.nan))
+
+
+def _believed_power(found: CameraGains, stated: np.ndarray | None) -> float:
+    """Posterior mean of the power, cameras differing by `USUAL_POWER`; 1 where nothing is stated."""
+    power, error = _power(found, stated)
+    return 1.0 + (power - 1.0) * USUAL_POWER**2 / (USUAL_POWER**2 + error**2) if np.isfinite(error) else 1.0
+
+
+def power_of_exposures(found: np.ndarray, stated: np.ndarray) -> tuple[float, float]:
+    """Return the slope q of ln found_v = q ln stated_v + c and its standard error
+    (docs/method/camera.md#stated-exposures).
+
+    The line is robust (Student's t of four degrees of freedom): a phone that merges several pictures states the time of one.
+
+    Args:
+        found: (V,) exposures > 0; stated: (V,) up to one factor, NaN = none.
+
+    Returns:
+        (1, infinite) with fewer than `_FEWEST_STATED` of them, if all that are stated are the same, or if the slope is no power
+        of a camera: what is stated then belongs to other photographs.
+    """
+    use = np.isfinite(stated) & np.isfinite(found) & (np.nan_to_num(stated) > 0) & (found > 0)
+    count = int(use.sum())
+    if count < _FEWEST_STATED:
+        return 1.0, np.inf
+    x, y = np.log(stated[use].astype(np.float64)), np.log(found[use].astype(np.float64))
+    weight = np.ones(count)
+    for _ in range(_ROUNDS):
+        x0, y0 = x - weight @ x / weight.sum(), y - weight @ y / weight.sum()
+        spread = float(weight @ x0**2)
+        if spread < 1e-12 * count:
+            return 1.0, np.inf
+        slope = float(weight @ (x0 * y0)) / spread
+        away = y0 - slope * x0
+        scale2 = max(float(weight @ away**2) / (weight.sum() * (1.0 - 2.0 / count)), 1e-12)
+        weight = 5.0 / (4.0 + away**2 / scale2)
+    if not _POWERS[0] <= slope <= _POWERS[1]:
+        return 1.0, np.inf
+    return slope, float(np.sqrt(2.0 * scale2 / spread))  # the variance of t is twice its scale squared
 
 
 def _without_powers(gain: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -219,6 +286,14 @@ def _unknown(family: str, stops: float, rows: int, gains: CameraGains, given: bo
         reason = f"{rows} rows of surface under different exposures in the best channel, {_MIN_ROWS} needed: taken as {family}"
     covariance = _SIGMA**2 * np.eye(start.params.size)
     return CalibratedResponse(start, covariance, stops, 0, 0.0, 0.0, [], reason, gains.exposure, gains=None if given else gains)
+
+
+def _of_power(found: CalibratedResponse, power: float) -> CalibratedResponse:
+    """A curve that is not known, but for the power that stated exposures tell: f(x^q)."""
+    x = np.linspace(0.0, 1.0, _SAMPLES) ** 2  # dense where the curve is steep
+    curve = sampled_response(x, found.response(np.repeat(x[:, None], 3, 1) ** power).T)
+    reason = f"{found.reason} of the power {power:.2f} of the radiance"
+    return replace(found, response=curve, covariance=np.zeros((0, 0)), reason=reason, gauge=STATED)
 
 
 def _compared(families: Sequence[str], fits: Sequence[Fitted]) -> tuple[list[dict[str, object]], int]:

@@ -23,7 +23,11 @@ from iif_core.surface.cells import grid_origin
 
 
 def calibrated(
-    photos: Photographs, families: Sequence[str], measured: tuple[Response, str] | None, given: bool
+    photos: Photographs,
+    families: Sequence[str],
+    measured: tuple[Response, str] | None,
+    given: bool,
+    stated: np.ndarray | None = None,
 ) -> tuple[Photographs, CalibratedResponse]:
     """Find the camera response and the gains that go with it.
 
@@ -33,7 +37,7 @@ def calibrated(
         photos: whose sensor has no curve yet.
         families: of curves, of which the one is taken that fits surface seen under different exposures best.
         measured: the curve and where it is from, where it is known; `families` are not used.
-        given: exposures are known, and not estimated.
+        given: exposures are known, and not estimated; stated: of every view, what its file says, NaN = nothing.
 
     Returns:
         The photographs with both, and how they were found.
@@ -48,7 +52,8 @@ def calibrated(
         found = given_response(*measured, exposure)
     else:
         moving = replace(rows, view=np.searchsorted(number, rows.view).astype(np.int32))
-        found = calibrate_response(moving, exposure, families, photos.sensor.saturation, given=given)
+        said = None if stated is None else stated[number]
+        found = calibrate_response(moving, exposure, families, photos.sensor.saturation, given, said)
     photos.log.say(f"camera response: {found.reason}")
     gains = _all_gains(photos.gains, number, found, rows) if estimated else photos.gains
     return replace(photos, sensor=replace(photos.sensor, curve=found.response), gains=gains), found

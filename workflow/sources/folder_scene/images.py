@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mmap
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -34,12 +34,19 @@ TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
 """EXIF orientation -> function that turns stored pixels upright."""
 
 
+_PHOTO_IFD = 0x8769
+_EXPOSURE_TAGS = ((33434, None, (1e-7, 1e4)), (34855, None, (1.0, 1e7)), (33437, 1.0, (0.3, 256.0)))
+"""EXIF tags of exposure time (s), ISO speed and f number; what counts if there is none; limits."""
+
+
 @dataclass(frozen=True)
 class Header:
-    """Size (width, height) as stored, and EXIF orientation 1 ... 8 (1 = upright)."""
+    """Size (width, height) as stored, EXIF orientation 1 ... 8 (1 = upright), and the exposure that EXIF states: time x ISO / (f
+    number)^2, s; None = not stated."""
 
     size: tuple[int, int]
     orientation: int = 1
+    exposure: float | None = None
 
 
 @dataclass
@@ -71,12 +78,30 @@ def _header(path: Path, _stamp: tuple[int, int]) -> Header:
         with opened(path) as image:
             if image.mode not in MODES:
                 raise InputError(f"{path}: colour mode {image.mode}; allowed: grey, RGB, RGBA of 8 or 16 bits. Convert it")
-            orientation = image.getexif().get(274, 1) or 1
+            exif = image.getexif()
+            orientation = exif.get(274, 1) or 1
             turned = isinstance(orientation, int) and 1 <= orientation <= 8
-            found = Header(image.size, orientation if turned else 1)
+            found = Header(image.size, orientation if turned else 1, _stated_exposure(exif.get_ifd(_PHOTO_IFD)))
         if not _complete(path):
             raise InputError(f"{path}: cut short (no end mark: an interrupted copy or download?); copy the file again")
     return found
+
+
+def _stated_exposure(photo: Mapping[int, Any]) -> float | None:
+    """Exposure by the tags of a photograph; None if one is missing, or is no number that a camera could have. A lens of unknown f
+    number counts as f/1: telephones have one for all photographs."""
+    values = []
+    for tag, usual, (least, most) in _EXPOSURE_TAGS:
+        told = photo.get(tag, usual)
+        try:
+            value = float(told[0] if isinstance(told, tuple | list) else told)
+        except (TypeError, ValueError, IndexError, ZeroDivisionError):
+            return None
+        if not least <= value <= most:
+            return None
+        values.append(value)
+    time, speed, number = values
+    return time * speed / number**2
 
 
 def header(path: Path) -> Header:
