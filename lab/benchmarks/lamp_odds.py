@@ -1,6 +1,6 @@
 """The numbers of the probability of a lamp (docs/method/light.md#probability-of-a-lamp), from drawn rooms.
 
-    python lab/benchmarks/lamp_odds.py 16 17 ... [--variant ""] [--quality draft]
+    python lab/benchmarks/lamp_odds.py 16 17 ... [--variant ours] [--quality draft]
 
 Run it in the working folder, with drawn rooms whose light is finished. It prints the numbers of
 `iif_core.light.emission.odds.PROBABILITY` fitted to these rooms, and how often claims hold in rooms that did not fit them.
@@ -49,7 +49,7 @@ def emitters_of(number: int, variant: str, quality: str) -> tuple[Array, Array]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rooms", nargs="+", type=int)
-    parser.add_argument("--variant", default="")
+    parser.add_argument("--variant", default="ours", help="of lab/config/studies/drawn.yaml")
     parser.add_argument("--quality", default="draft")
     args = parser.parse_args()
     parts = [emitters_of(number, args.variant, args.quality) for number in args.rooms]
