@@ -5,7 +5,7 @@ The robust fit eliminates the levels of the patches; a term enters the model whe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,6 +56,8 @@ class CameraGains:
         estimated: (V,) bool.
         residual: robust spread of log y about the model.
         evidence: for `white_balance` and `vignetting`, as far as they were tried.
+        group: (V,) int, views with the same number are connected by shared surface, -1 = not estimated; None = not told. Only
+            within a group are factors known relative to one another.
     """
 
     gain: np.ndarray
@@ -63,6 +65,7 @@ class CameraGains:
     estimated: np.ndarray
     residual: float = 0.0
     evidence: dict[str, Evidence] = field(default_factory=dict)
+    group: np.ndarray | None = None
 
     @classmethod
     def plain(cls, exposure: np.ndarray) -> CameraGains:
@@ -79,6 +82,13 @@ class CameraGains:
     def is_plain(self) -> bool:
         """Whether each view has one factor only."""
         return not self.vignetting.any() and bool((self.gain == self.gain[:, :1]).all())
+
+    def raised(self, power: float) -> CameraGains:
+        """Return the gains of f(x^(1 / power)) for those of f(x): all that was estimated, to a power, around its mean."""
+        own = self.estimated[:, None]
+        middle = np.exp(np.log(self.gain[self.estimated]).mean()) if own.any() else 1.0
+        gain = np.where(own, middle * (self.gain / middle) ** power, self.gain)
+        return replace(self, gain=gain, vignetting=power * self.vignetting)
 
     def factor(self, view: np.ndarray | int, radius2: np.ndarray) -> np.ndarray:
         """Factors (n, 3) of pixels at squared radius (n,), in views (n,) or in one view."""
@@ -177,7 +187,8 @@ def estimate(rows: GainRows, n_views: int, white_balance: bool = True, vignettin
             break
     gains = theta[: 3 * n_views].reshape(n_views, 3) if white_balance else np.repeat(theta[:n_views, None], 3, 1)
     gains, seen = _grey(gains, tied, group), group >= 0
-    return CameraGains(np.exp(np.where(seen[:, None], gains, 0.0)), theta[-2:] if vignetting else np.zeros(2), seen, scale)
+    found = np.exp(np.where(seen[:, None], gains, 0.0))
+    return CameraGains(found, theta[-2:] if vignetting else np.zeros(2), seen, scale, group=group)
 
 
 def choose_gains(rows: GainRows, n_views: int) -> CameraGains:
@@ -199,7 +210,7 @@ def choose_gains(rows: GainRows, n_views: int) -> CameraGains:
         evidence[term] = Evidence(gain, error, size, included, before, after)
         if included:
             model[term], best = True, wider
-    return CameraGains(best.gain, best.vignetting, best.estimated, best.residual, evidence)
+    return replace(best, evidence=evidence)
 
 
 @dataclass(frozen=True)

@@ -284,9 +284,10 @@ def choose_kinds(
     witnesses = np.zeros((len(counts), 3))
     if stated is not None:
         of_base = stated.roughness_prior(mean_base[:, 3], ROUGHNESS_GRID)
-        witnesses = np.column_stack(
-            [stated.metal_log_odds(mean_base[:, 4]), _metal_against_dielectric(likelihood * of_base[:, None], brightness, counts)]
-        )
+        of_photographs = log_likelihood + np.log(of_base)[:, None]
+        told = counts & np.isfinite(cost[:, :2]).any(2).all(1)
+        kinds = _metal_against_dielectric(of_photographs, brightness, told)
+        witnesses = np.column_stack([stated.metal_log_odds(mean_base[:, 4]), kinds])
     metal = metal_log_odds(witnesses)
 
     # -------- EM: posteriors of the objects, then the histogram they share (Eq. M.23) --------
@@ -378,16 +379,20 @@ def _likelihood_of_base(posterior: np.ndarray, roughness: np.ndarray, pixels: np
     return likelihood / likelihood.max(1, keepdims=True)
 
 
-def _metal_against_dielectric(likelihood: np.ndarray, brightness: np.ndarray, counts: np.ndarray) -> np.ndarray:
+def _metal_against_dielectric(log_likelihood: np.ndarray, brightness: np.ndarray, told: np.ndarray) -> np.ndarray:
     """Logarithms (O, 2) of the evidence for a metal over that for a dielectric, and of the brightness that a metal would have
-    over that of the base; 0 for objects that do not count.
+    over that of the base; 0 for objects of which nothing is `told`, (O,) bool.
 
-    likelihood: (O, 3, R) of photographs and base, up to a factor; brightness: (O, 3, R) relative to the base; counts: (O,).
+    log_likelihood: (O, 3, R) of photographs and base, minus infinity = excluded; brightness: (O, 3, R) relative to the base.
     """
-    total = np.maximum(likelihood.sum(2), 1e-300)
-    evidence = np.log(total[:, 1]) - np.log(total[:, 0])
-    brighter = (likelihood[:, 1] * brightness[:, 1]).sum(1) / total[:, 1]
-    return np.where(counts[:, None], np.column_stack([evidence, brighter]), 0.0)
+    # Relative to the largest of each kind, which may be far below that of the other.
+    own = np.where(told[:, None, None], log_likelihood[:, :2], 0.0)
+    largest = own.max(2)
+    share = np.exp(own - largest[:, :, None])
+    total = share.sum(2)
+    evidence = largest[:, 1] - largest[:, 0] + np.log(total[:, 1] / total[:, 0])
+    brighter = (share[:, 1] * brightness[:, 1]).sum(1) / total[:, 1]
+    return np.where(told[:, None], np.column_stack([evidence, brighter]), 0.0)
 
 
 def metal_log_odds(witnesses: np.ndarray, numbers: tuple[float, float, float, float] = METAL_ODDS) -> np.ndarray:

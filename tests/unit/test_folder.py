@@ -195,48 +195,61 @@ def test_turns_agree_with_pillow(orientation):
 
 
 def _stating(path, time=None, speed=None, number=None):
-    """Save a small photograph whose file states how it was taken; return the exposure that is read."""
+    """Save a small photograph whose file states how it was taken; return what is read."""
     from PIL import Image
 
     exif = Image.Exif()
     tags = {33434: time, 34855: speed, 33437: number}
     exif.get_ifd(0x8769).update({tag: value for tag, value in tags.items() if value is not None})
     Image.new("RGB", (8, 6)).save(path, exif=exif)
-    return images.header(path).exposure
+    return images.header(path).stated
 
 
 def test_exposures_that_files_state(tmp_path):
-    assert _stating(tmp_path / "a.jpg", 1 / 50, 200, 2.0) == pytest.approx(200 / 50 / 4, rel=1e-3)
-    assert _stating(tmp_path / "b.jpg", 1 / 50, 200) == pytest.approx(200 / 50, rel=1e-3)
-    for number, wrong in enumerate([(), (0.02,), (0.02, 0, 2.0), (0.0, 100, 2.0), (0.02, 100, 0.0), (1e6, 100, 2.0)]):
+    assert _stating(tmp_path / "a.jpg", 1 / 50, 200, 2.0) == pytest.approx((200 / 50, 2.0), rel=1e-3)
+    assert _stating(tmp_path / "b.jpg", 1 / 50, 200) == (pytest.approx(200 / 50, rel=1e-3), None)
+    for number, wrong in enumerate([(), (0.02,), (0.02, 0, 2.0), (0.02, 65535), (0.0, 100), (0.02, 100, 0.0), (1e6, 100, 2.0)]):
         assert _stating(tmp_path / f"wrong{number}.jpg", *wrong) is None
     from PIL import Image
 
     beyond, itself = b"II*\0\xff\xff\xff\xff", b"MM\0*\0\0\0\x08\0\x01\x87\x69\0\x04\0\0\0\x01\0\0\0\x08"
     for broken in (b"Exif\0\0", b"Exif\0\0" + beyond, b"Exif\0\0" + itself):
         Image.new("RGB", (8, 6)).save(tmp_path / "broken.jpg", exif=broken)
-        assert images.header(tmp_path / "broken.jpg").exposure is None
+        assert images.header(tmp_path / "broken.jpg").stated is None
+
+
+def _stated_by_capture(folder, photographs):
+    """Exposures in the capture of photographs whose files state time, ISO speed and f number; None = no EXIF."""
+    from PIL import Image
+
+    document = own.bare(folder / "data/own", len(photographs))
+    for frame, tags in zip(document["frames"], photographs, strict=True):
+        path = folder / "data/own" / frame["file_path"]
+        if tags is None:
+            continue
+        exif = Image.Exif()
+        exif.get_ifd(0x8769).update(dict(zip((33434, 34855, 33437), tags, strict=False)))
+        Image.open(path).convert("RGB").save(path.with_suffix(".jpg"), exif=exif, quality=95)
+        frame["file_path"] = str(path.with_suffix(".jpg").relative_to(folder / "data/own"))
+    own.write_transforms(folder / "data/own", document)
+    own.project(folder)
+    return own.run(folder, "capture")
 
 
 def test_stated_exposures_stand_in_the_capture(tmp_path):
-    document = own.bare(tmp_path / "data/own")
-    names = [frame["file_path"] for frame in document["frames"]]
-    for number, name in enumerate(names[:-1]):
-        from PIL import Image
-
-        exif = Image.Exif()
-        exif.get_ifd(0x8769).update({33434: 0.01 * 2**number, 34855: 100})
-        path = tmp_path / "data/own" / name
-        target = path.with_suffix(".jpg")
-        Image.open(path).convert("RGB").save(target, exif=exif, quality=95)
-        document["frames"][number]["file_path"] = str(target.relative_to(tmp_path / "data/own"))
-    own.write_transforms(tmp_path / "data/own", document)
-    own.project(tmp_path)
-    capture = own.run(tmp_path, "capture")
+    capture = _stated_by_capture(tmp_path, [(0.01, 100), (0.02, 200), None])
     stated = capture.stated_exposures()
-    assert len(stated) == len(names) and np.isnan(stated[-1])
-    np.testing.assert_allclose(stated[:-1], 2.0 ** np.arange(len(names) - 1), rtol=1e-3)
-    assert capture.stated_exposures(capture.views[1:2]) == pytest.approx([2.0], rel=1e-3)
+    np.testing.assert_allclose(stated, [1.0, 4.0, np.nan], rtol=1e-3)
+    assert capture.stated_exposures(capture.views[1:2]) == pytest.approx([4.0], rel=1e-3)
+
+
+def test_photographs_without_an_f_number_state_nothing_beside_others_with_one(tmp_path):
+    capture = _stated_by_capture(tmp_path, [(0.01, 100, 2.0), (0.02, 200), (0.04, 100, 4.0)])
+    np.testing.assert_allclose(capture.stated_exposures(), [0.25, np.nan, 0.25], rtol=1e-3)
+
+
+def test_without_exif_nothing_is_stated(tmp_path):
+    assert _stated_by_capture(tmp_path, [None, None, None]).stated_exposures() is None
 
 
 def test_exif_turned_picture_is_turned_when_the_cameras_say_so(tmp_path):

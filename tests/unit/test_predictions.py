@@ -111,6 +111,16 @@ def test_any_evidence_gives_probabilities(metallic, evidence, brighter):
     np.testing.assert_allclose(probability.sum(1), 1.0, rtol=1e-12)
 
 
+def test_witnesses_of_metal_are_written_as_they_are():
+    """However much the photographs speak against a metal, its brightness is what it is; what is known by hand is no witness."""
+    some = np.array([0.5]), np.array([-1e6])
+    witnesses = chosen(*some, ERRORS, brighter=1.4).kinds.witnesses
+    assert witnesses[0, 0] == pytest.approx(3.4) and witnesses[0, 1] < -9e5 and witnesses[0, 2] == pytest.approx(1.4)
+    known = chosen(*some, ERRORS, given=np.array([[np.nan, 1.0]])).kinds
+    np.testing.assert_array_equal(known.witnesses[0, 1:], 0.0)
+    assert not chosen(*some, None).kinds.witnesses.any()
+
+
 def test_roughness_follows_the_base_where_photographs_say_nothing():
     cost = np.full((6, 3, len(ROUGHNESS_GRID)), np.inf)
     cost[:, 0] = 0.0

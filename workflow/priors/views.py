@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from iif_core.camera.calibration.choice import STATED, calibrate_response
+from iif_core.camera.calibration.choice import calibrate_response
 from iif_core.camera.overlap import PatchRows, join_rows, patch_edge, patch_numbers, patch_rows
 from iif_core.camera.pixels import ViewMaps
 from iif_core.camera.response import Response
@@ -127,7 +127,7 @@ class CaptureViews:
         found = calibrate_response(self._shared_surface(), self.exposure, (FAMILY,), SATURATED, given, stated)
         self.exposure = np.asarray(found.exposure, np.float64)
         self._kept.forget()
-        if not found.rows and found.gauge != STATED:
+        if not found.rows and found.response.family != "sampled":
             return f"{found.reason.split(':')[0]}: taken as the power {GAMMA}"
         self.response = found.response
         return found.reason

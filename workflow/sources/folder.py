@@ -322,11 +322,14 @@ def _write(
 
 
 def _stated(task: _Task, frames: Sequence[Frame]) -> dict[str, float]:
-    """Exposures that the files of photographs through a response state, by the names of the views."""
+    """Exposures t S / N^2 that the files of photographs through a response state, by the names of the views. A lens of unknown f
+    number counts as f/1 where no photograph states one, as with telephones; otherwise such photographs state nothing."""
     if not task.encoded:
         return {}
-    stated = {frame.name: images.header(frame.image).exposure for frame in frames}
-    return {name: exposure for name, exposure in stated.items() if exposure is not None}
+    told = {frame.name: stated for frame in frames if (stated := images.header(frame.image).stated) is not None}
+    if any(stated.number is not None for stated in told.values()):
+        told = {name: stated for name, stated in told.items() if stated.number is not None}
+    return {name: stated.time_speed / (stated.number or 1.0) ** 2 for name, stated in told.items()}
 
 
 # ------------------------------------------------------------------------------------------------------------- alignment

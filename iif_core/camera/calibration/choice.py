@@ -30,9 +30,13 @@ GAUGE = (
 STATED = "exposures were found together with the response; their power is that of the exposures that the photographs' files state"
 USUAL_POWER = 0.1
 """Standard deviation over cameras of the power that is left open, as found near sRGB."""
-_SURE_POWER = 0.05  # error of a power from stated exposures up to which it is said to be theirs
+STATED_ERROR = 0.07
+"""Error of a stated exposure, as a logarithm, before any was compared; it counts as `_PSEUDO_STATED` photographs."""
+_PSEUDO_STATED = 4.0
+_SURE_POWER = 0.06  # error of a power from stated exposures up to which it is said to be theirs
 _FEWEST_STATED = 4  # photographs that state an exposure
 _POWERS = 0.5, 2.0  # that a camera may have
+_SAME_POWER = 0.01  # from 1, up to which a curve is left alone
 _SAMPLES = 1024  # of a curve that is a power of another
 _ROUNDS = 10  # of the robust line through stated and found exposures
 _SIGNIFICANT = 2.0  # standard errors
@@ -116,33 +120,32 @@ def calibrate_response(
         start = response(families[0])
         reason = "photographs are linear radiance" if start.family == "identity" else "set to srgb"
         return given_response(start, reason, exposure)
-    gains = CameraGains.plain(exposure)
+    gains, power = CameraGains.plain(exposure), None
     if not given:
-        gains = _gains(rows, response(families[0]), gains, stated=stated)
+        gains = _gains(rows, response(families[0]), gains)
+        power = StatedPower.of(gains, stated)
+        gains = power.forced(gains)
     channels = [channel_rows(rows, c, gains, saturation) for c in range(3)]
     enough = [c for c in range(3) if len(channels[c].cell) >= _MIN_ROWS]
     stops = max(channel.stops for channel in channels)
     if not enough:
-        most, plain = max(len(c.cell) for c in channels), CameraGains.plain(exposure)
-        if given:
-            return _unknown(families[0], stops, most, gains, given)
-        start = response(families[0])
-        power = _believed_power(_gains(rows, start, plain, choose=True), stated)
-        found = _unknown(families[0], stops, most, _gains(rows, start, plain, choose=True, stated=stated), given)
-        return found if power == 1.0 else _of_power(found, power)
+        most = max(len(c.cell) for c in channels)
+        plain = gains if given else _gains(rows, response(families[0]), CameraGains.plain(exposure), choose=True)
+        return _of_power(_unknown(families[0], stops, most, plain, given), power)
     common = concatenate_channels([channel_rows(rows, c, gains, saturation, MAX_ROWS // len(enough)) for c in enough])
     if not given:
         # The terms of the gains are chosen under the richest curve, fitted with one gain per view: under a wrong curve,
         # channels of different brightness seem to need gains of their own.
         rich = _fit(families[-1], common, channels, enough).response
-        gains = _gains(rows, rich, gains, choose=True, stated=stated)
+        gains = _gains(rows, rich, gains, choose=True, power=power)
         logs = log_factor(rows, gains)
         common, channels = common.exposed(logs), [channel.exposed(logs) for channel in channels]
     fits, found = [], []
     for family in families:
         fit, views = _fit(family, common, channels, enough), gains
         if not given:  # the gains under this curve, and the curve under these gains
-            views = _gains(rows, fit.response, gains, stated=stated)
+            # A curve without parameters cannot follow a power; it gets its own at the end, which fits as well.
+            views = _gains(rows, fit.response, gains, power=power if START[family] else None)
             logs = log_factor(rows, views)
             fit = _fit(family, common.exposed(logs), [channel.exposed(logs) for channel in channels], enough)
         fits.append(fit)
@@ -153,7 +156,7 @@ def calibrate_response(
     before = maximise(common, response(families[chosen]), np.array(START[families[chosen]]), _SIGMA, 0)
     used = sum(len(channels[c].cell) + len(channels[c].full) for c in enough)
     views = found[chosen]
-    return CalibratedResponse(
+    out = CalibratedResponse(
         fits[chosen].response,
         fits[chosen].covariance,
         stops,
@@ -163,9 +166,10 @@ def calibrate_response(
         table,
         _because(table, chosen, best, used, stops),
         views.exposure,
-        "" if given else STATED if _power(views, stated)[1] <= _SURE_POWER else GAUGE,
+        "" if given else STATED if power is not None and power.is_sure else GAUGE,
         None if given else views,
     )
+    return out if START[families[chosen]] else _of_power(out, power)
 
 
 def candidates(setting: str, dynamic_range: str) -> tuple[str, ...]:
@@ -200,13 +204,13 @@ def gain_rows(rows: PatchRows, curve: Response) -> GainRows:
 
 
 def _gains(
-    rows: PatchRows, curve: Response, start: CameraGains, choose: bool = False, stated: np.ndarray | None = None
+    rows: PatchRows, curve: Response, start: CameraGains, choose: bool = False, power: StatedPower | None = None
 ) -> CameraGains:
     """Gains under a curve, scaled to the mean exposure of `start`.
 
     With `choose`, the terms of the model that held-out surface supports; otherwise those that `start` was found to need, or
-    exposure and vignetting if it has no evidence. The undetermined power is one for all channels (Eq. C.28), that of the `stated`
-    exposures as far as these tell it.
+    exposure and vignetting if it has no evidence. The undetermined power is one for all channels (Eq. C.28), and that of stated
+    exposures if there is one.
     """
     linear, n_views = gain_rows(rows, curve).thinned(), len(start.gain)
     if choose:
@@ -215,53 +219,89 @@ def _gains(
         terms = {name: entry.included for name, entry in start.evidence.items()} or {"white_balance": False}
         found = replace(estimate(linear, n_views, **terms), evidence=start.evidence)
     found = replace(found, gain=_without_powers(found.gain, found.estimated))
-    power = _believed_power(found, stated)
-    found = replace(found, gain=np.where(found.estimated[:, None], found.gain ** (1.0 / power), found.gain))
+    found = power.forced(found) if power is not None else found
     known = start.exposure[np.isfinite(start.exposure) & (start.exposure > 0)]
     mean = float(np.exp(np.mean(np.log(known)))) if len(known) else 1.0
     return replace(found, gain=found.gain * mean)
 
 
-def _power(found: CameraGains, stated: np.ndarray | None) -> tuple[float, float]:
-    """Power of the found over the stated exposures, and its standard error; (1, infinite) if too few are stated."""
-    if stated is None:
-        return 1.0, np.inf
-    return power_of_exposures(found.exposure, np.where(found.estimated, stated, np.nan))
+@dataclass(frozen=True)
+class StatedPower:
+    """What stated exposures tell of the power of those that are found (docs/method/camera.md#stated-exposures).
+
+    Attributes:
+        stated: (V,) up to one factor, NaN = none; None: no file states one.
+        power: of the found over the stated exposures with a curve near sRGB; error: its standard error, infinite = not told.
+    """
+
+    stated: np.ndarray | None
+    power: float = 1.0
+    error: float = np.inf
+
+    @classmethod
+    def of(cls, found: CameraGains, stated: np.ndarray | None) -> StatedPower:
+        """Compare gains that were found with a curve near sRGB."""
+        return cls(None) if stated is None else cls(stated, *_line(found, stated))
+
+    @property
+    def is_sure(self) -> bool:
+        return self.error <= _SURE_POWER
+
+    @property
+    def believed(self) -> float:
+        """Posterior mean of the power, cameras differing by `USUAL_POWER`; 1 where nothing is told."""
+        if not np.isfinite(self.error):
+            return 1.0
+        return 1.0 + (self.power - 1.0) * USUAL_POWER**2 / (USUAL_POWER**2 + self.error**2)
+
+    def forced(self, found: CameraGains) -> CameraGains:
+        """Return the gains raised to the power at which their slope on the stated exposures is `power` over `believed`, whatever
+        the curve is with which they were found."""
+        if not np.isfinite(self.error):
+            return found
+        slope, error = _line(found, self.stated)
+        return found.raised(self.power / self.believed / slope) if np.isfinite(error) else found
 
 
-def _believed_power(found: CameraGains, stated: np.ndarray | None) -> float:
-    """Posterior mean of the power, cameras differing by `USUAL_POWER`; 1 where nothing is stated."""
-    power, error = _power(found, stated)
-    return 1.0 + (power - 1.0) * USUAL_POWER**2 / (USUAL_POWER**2 + error**2) if np.isfinite(error) else 1.0
+def _line(found: CameraGains, stated: np.ndarray | None) -> tuple[float, float]:
+    assert stated is not None
+    return power_of_exposures(found.exposure, np.where(found.estimated, stated, np.nan), found.group)
 
 
-def power_of_exposures(found: np.ndarray, stated: np.ndarray) -> tuple[float, float]:
-    """Return the slope q of ln found_v = q ln stated_v + c and its standard error
+def power_of_exposures(found: np.ndarray, stated: np.ndarray, group: np.ndarray | None = None) -> tuple[float, float]:
+    """Return the slope q of ln found_v = q ln stated_v + c_g and its standard error
     (docs/method/camera.md#stated-exposures).
 
     The line is robust (Student's t of four degrees of freedom): a phone that merges several pictures states the time of one.
 
     Args:
         found: (V,) exposures > 0; stated: (V,) up to one factor, NaN = none.
+        group: (V,) of views that are known relative to one another, each of which has a constant c_g of its own; None: all are.
 
     Returns:
-        (1, infinite) with fewer than `_FEWEST_STATED` of them, if all that are stated are the same, or if the slope is no power
-        of a camera: what is stated then belongs to other photographs.
+        (1, infinite) with fewer than `_FEWEST_STATED` of them, if all that are stated in a group are the same, or if the slope is
+        no power of a camera: what is stated then belongs to other photographs.
     """
     use = np.isfinite(stated) & np.isfinite(found) & (np.nan_to_num(stated) > 0) & (found > 0)
-    count = int(use.sum())
-    if count < _FEWEST_STATED:
+    own = np.zeros(int(use.sum()), np.int64) if group is None else np.unique(group[use], return_inverse=True)[1]
+    count, groups = len(own), int(own.max(initial=-1)) + 1
+    if count < _FEWEST_STATED or count - groups < 2:
         return 1.0, np.inf
     x, y = np.log(stated[use].astype(np.float64)), np.log(found[use].astype(np.float64))
     weight = np.ones(count)
+
+    def centred(values: np.ndarray) -> np.ndarray:
+        return values - (np.bincount(own, weight * values, groups) / np.bincount(own, weight, groups))[own]
+
     for _ in range(_ROUNDS):
-        x0, y0 = x - weight @ x / weight.sum(), y - weight @ y / weight.sum()
+        x0, y0 = centred(x), centred(y)
         spread = float(weight @ x0**2)
-        if spread < 1e-12 * count:
+        if spread < 1e-4 * count:  # they differ by less than a seventieth of a stop
             return 1.0, np.inf
         slope = float(weight @ (x0 * y0)) / spread
         away = y0 - slope * x0
-        scale2 = max(float(weight @ away**2) / (weight.sum() * (1.0 - 2.0 / count)), 1e-12)
+        freedom = weight.sum() * (1.0 - (groups + 1) / count)
+        scale2 = (float(weight @ away**2) + _PSEUDO_STATED * STATED_ERROR**2) / (freedom + _PSEUDO_STATED)
         weight = 5.0 / (4.0 + away**2 / scale2)
     if not _POWERS[0] <= slope <= _POWERS[1]:
         return 1.0, np.inf
@@ -288,12 +328,21 @@ def _unknown(family: str, stops: float, rows: int, gains: CameraGains, given: bo
     return CalibratedResponse(start, covariance, stops, 0, 0.0, 0.0, [], reason, gains.exposure, gains=None if given else gains)
 
 
-def _of_power(found: CalibratedResponse, power: float) -> CalibratedResponse:
-    """A curve that is not known, but for the power that stated exposures tell: f(x^q)."""
+def _of_power(found: CalibratedResponse, power: StatedPower | None) -> CalibratedResponse:
+    """A curve without a parameter that could follow the power that stated exposures tell, f(x^q), and the gains that go with it:
+    photographs agree as well as before."""
+    if power is None or found.gains is None or not np.isfinite(power.error):
+        return found
+    gains = power.forced(found.gains)
+    slope, forced = _line(found.gains, power.stated)[0], _line(gains, power.stated)[0]
+    q = slope / forced
+    found = replace(found, gauge=STATED if power.is_sure else GAUGE)
+    if abs(q - 1.0) <= _SAME_POWER:
+        return found
     x = np.linspace(0.0, 1.0, _SAMPLES) ** 2  # dense where the curve is steep
-    curve = sampled_response(x, found.response(np.repeat(x[:, None], 3, 1) ** power).T)
-    reason = f"{found.reason} of the power {power:.2f} of the radiance"
-    return replace(found, response=curve, covariance=np.zeros((0, 0)), reason=reason, gauge=STATED)
+    curve = sampled_response(x, found.response(np.repeat(x[:, None], 3, 1) ** q).T)
+    reason = f"{found.reason}; of the power {q:.2f} of the radiance"
+    return replace(found, response=curve, covariance=np.zeros((0, 0)), reason=reason, gains=gains, exposure=gains.exposure)
 
 
 def _compared(families: Sequence[str], fits: Sequence[Fitted]) -> tuple[list[dict[str, object]], int]:

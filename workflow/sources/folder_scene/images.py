@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,18 +35,24 @@ TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
 
 
 _PHOTO_IFD = 0x8769
-_EXPOSURE_TAGS = ((33434, None, (1e-7, 1e4)), (34855, None, (1.0, 1e7)), (33437, 1.0, (0.3, 256.0)))
-"""EXIF tags of exposure time (s), ISO speed and f number; what counts if there is none; limits."""
+_EXPOSURE_TAGS = ((33434, (1e-7, 1e4)), (34855, (1.0, 65534.0)), (33437, (0.3, 256.0)))
+"""EXIF tags of exposure time (s), ISO speed (65535 stands for more than 16 bits hold) and f number, and their limits."""
+
+
+class Stated(NamedTuple):
+    """What EXIF says of an exposure: time (s) times ISO speed, and f number, None = not stated."""
+
+    time_speed: float
+    number: float | None
 
 
 @dataclass(frozen=True)
 class Header:
-    """Size (width, height) as stored, EXIF orientation 1 ... 8 (1 = upright), and the exposure that EXIF states: time x ISO / (f
-    number)^2, s; None = not stated."""
+    """Size (width, height) as stored, EXIF orientation 1 ... 8 (1 = upright), and the exposure that EXIF states."""
 
     size: tuple[int, int]
     orientation: int = 1
-    exposure: float | None = None
+    stated: Stated | None = None
 
 
 @dataclass
@@ -87,21 +93,20 @@ def _header(path: Path, _stamp: tuple[int, int]) -> Header:
     return found
 
 
-def _stated_exposure(photo: Mapping[int, Any]) -> float | None:
-    """Exposure by the tags of a photograph; None if one is missing, or is no number that a camera could have. A lens of unknown f
-    number counts as f/1: telephones have one for all photographs."""
-    values = []
-    for tag, usual, (least, most) in _EXPOSURE_TAGS:
-        told = photo.get(tag, usual)
+def _stated_exposure(photo: Mapping[int, Any]) -> Stated | None:
+    """Exposure by the tags of a photograph; None if time or speed is missing, or a tag is no number that a camera could have."""
+    values: list[float | None] = []
+    for tag, (least, most) in _EXPOSURE_TAGS:
+        told = photo.get(tag)
         try:
-            value = float(told[0] if isinstance(told, tuple | list) else told)
+            value = None if told is None else float(told[0] if isinstance(told, tuple | list) else told)
         except (TypeError, ValueError, IndexError, ZeroDivisionError):
             return None
-        if not least <= value <= most:
+        if value is not None and not least <= value <= most:
             return None
         values.append(value)
     time, speed, number = values
-    return time * speed / number**2
+    return None if time is None or speed is None else Stated(time * speed, number)
 
 
 def header(path: Path) -> Header:
