@@ -53,9 +53,6 @@ class Room(Files):
 
     is_hdr, facts = False, {}
 
-    def stated_exposures(self, views=None):
-        return None
-
     def __init__(self):
         super().__init__()
         self.used = [_view(number) for number in range(4)]

@@ -17,7 +17,7 @@ from tests.unit import own_scene as own
 from workflow.artifacts import StageReader
 from workflow.exporters.camera_files import cameras_json
 from workflow.exporters.glb import rotation_to_y
-from workflow.scene.normal_form import View
+from workflow.scene.normal_form import View, stated_exposures
 from workflow.settings.source import FolderSource
 from workflow.sources import folder
 from workflow.sources.folder_scene import alignment, images, mesh, transforms
@@ -238,18 +238,19 @@ def _stated_by_capture(folder, photographs):
 
 def test_stated_exposures_stand_in_the_capture(tmp_path):
     capture = _stated_by_capture(tmp_path, [(0.01, 100), (0.02, 200), None])
-    stated = capture.stated_exposures()
+    stated = stated_exposures(capture.facts, capture.views)
     np.testing.assert_allclose(stated, [1.0, 4.0, np.nan], rtol=1e-3)
-    assert capture.stated_exposures(capture.views[1:2]) == pytest.approx([4.0], rel=1e-3)
+    assert stated_exposures(capture.facts, capture.views[1:2]) == pytest.approx([4.0], rel=1e-3)
 
 
 def test_photographs_without_an_f_number_state_nothing_beside_others_with_one(tmp_path):
     capture = _stated_by_capture(tmp_path, [(0.01, 100, 2.0), (0.02, 200), (0.04, 100, 4.0)])
-    np.testing.assert_allclose(capture.stated_exposures(), [0.25, np.nan, 0.25], rtol=1e-3)
+    np.testing.assert_allclose(stated_exposures(capture.facts, capture.views), [0.25, np.nan, 0.25], rtol=1e-3)
 
 
 def test_without_exif_nothing_is_stated(tmp_path):
-    assert _stated_by_capture(tmp_path, [None, None, None]).stated_exposures() is None
+    capture = _stated_by_capture(tmp_path, [None, None, None])
+    assert stated_exposures(capture.facts, capture.views) is None
 
 
 def test_exif_turned_picture_is_turned_when_the_cameras_say_so(tmp_path):

@@ -179,9 +179,6 @@ class Capture:
 
     is_hdr = False
 
-    def stated_exposures(self, views=None):
-        return None
-
     def __init__(self, has_truth=True):
         self.has_truth = has_truth
         self.rows = np.mgrid[:HEIGHT, :WIDTH][0]

@@ -18,7 +18,7 @@ from iif_core.surface.cells import grid_origin
 from iif_core.surface.triangles import face_geometry, towards_viewer
 from workflow.runtime import device
 from workflow.scene.decoded import DecodedViews, Kept
-from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.normal_form import CaptureReader, View, stated_exposures
 from workflow.scene.photograph import GAMMA
 from workflow.segmentations.geometry import pieces
 from workflow.segmentations.surface import Surface
@@ -123,7 +123,7 @@ class CaptureViews:
         if self.capture.is_hdr or not self.views:
             return "photographs are linear radiance"
         given = not self.capture.facts.get("exposure_estimated", False)
-        stated = self.capture.stated_exposures(self.views)
+        stated = stated_exposures(self.capture.facts, self.views)
         found = calibrate_response(self._shared_surface(), self.exposure, (FAMILY,), SATURATED, given, stated)
         self.exposure = np.asarray(found.exposure, np.float64)
         self._kept.forget()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -135,6 +135,13 @@ class CaptureWriter:
         self.writer.json("capture.json", document)
 
 
+def stated_exposures(facts: Mapping[str, Any], views: Sequence[View]) -> np.ndarray | None:
+    """Return the exposures (views,) that the files of the photographs state, up to one factor, NaN = none; None: no file states
+    one. `facts`: of the capture."""
+    stated = facts.get("stated_exposure") or {}
+    return np.array([stated.get(view.name, np.nan) for view in views], np.float64) if stated else None
+
+
 class CaptureReader:
     """Reads the normal form of a finished capture stage."""
 
@@ -177,14 +184,6 @@ class CaptureReader:
     def exposures(self) -> np.ndarray:
         """Return the exposures (views,) in the order of the views."""
         return np.array([view.exposure for view in self.views], np.float64)
-
-    def stated_exposures(self, views: Sequence[View] | None = None) -> np.ndarray | None:
-        """Return the exposures (views,) that the files of the photographs state, up to one factor, NaN = none; of all views, or
-        of some. None: no file states one."""
-        stated = self.facts.get("stated_exposure") or {}
-        if not stated:
-            return None
-        return np.array([stated.get(view.name, np.nan) for view in (self.views if views is None else views)], np.float64)
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Return vertices (n, 3) float32 in metres and faces (m, 3) int32."""

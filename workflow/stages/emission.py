@@ -28,7 +28,7 @@ from workflow.scene.base_scene import read_base_scene
 from workflow.scene.emission_views import ViewRecords, view_exposures
 from workflow.scene.light_files import write_found_light
 from workflow.scene.named import object_names
-from workflow.scene.normal_form import CaptureReader
+from workflow.scene.normal_form import CaptureReader, stated_exposures
 from workflow.scene.response_file import read_response_file
 from workflow.settings.options import options_of
 
@@ -78,7 +78,7 @@ def _photographs(job: Job, capture: CaptureReader, notes: list[str]) -> tuple[Ph
         measured = read_response_file(Path(setting.file)), f"measured: {setting.file}"
     families = () if measured else candidates(setting, capture.facts["dynamic_range"])
     given = not capture.facts.get("exposure_estimated", False)
-    photos, camera = calibrated(photos, families, measured, given, capture.stated_exposures())
+    photos, camera = calibrated(photos, families, measured, given, stated_exposures(capture.facts, capture.views))
     notes.extend([camera.gauge] if camera.gauge else [])
     return photos, camera
 
