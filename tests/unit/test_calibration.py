@@ -1,6 +1,7 @@
 """Camera response from shared surface: known curves, choice of the family, size of the errors, extreme input."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ from iif_core.camera.calibration.choice import CANDIDATES, calibrate_response, c
 from iif_core.camera.gains import CameraGains, estimate
 from iif_core.camera.overlap import PatchRows, join_rows, no_rows, patch_rows
 from iif_core.camera.response import response
+from iif_core.light.emission import photographs as of_photographs
+from iif_core.light.emission import response as of_light
 from lab.simulated.photographs import response_curve
 
 EXPOSURES = np.array([0.25, 0.5, 1.0, 2.0, 4.0, 0.25, 1.0, 4.0])
@@ -322,3 +325,35 @@ def test_unknown_exposures_without_overlap_stay_what_they_were():
     out = calibrate_response(rows.take(rows.patch % 8 == rows.view), np.full(8, 3.0), given=False)
     np.testing.assert_allclose(out.exposure, 3.0)
     assert out.response.family == "srgb" and out.reason
+
+
+def test_stated_exposures_go_with_their_photographs(monkeypatch):
+    """Of five views the second is held out; what is stated of the others arrives in their order."""
+    asked = []
+
+    def found(rows, exposure, families, saturation, given, stated):
+        asked.append(stated)
+        return SimpleNamespace(response=response("srgb"), reason="", gains=CameraGains.plain(np.ones(4)))
+
+    monkeypatch.setattr(of_light, "calibrate_response", found)
+    monkeypatch.setattr(of_light, "_shared_surface", lambda photos: replace(no_rows(), view=np.zeros(0, np.int32)))
+    views, sensor = [0, 2, 3, 4], of_photographs.Sensor(response("identity"), False)
+    log = SimpleNamespace(say=lambda text: None)
+    photos = Photos(views, CameraGains.plain(np.ones(5)), sensor, log)
+    of_light.calibrated(photos, ("srgb",), None, False, np.array([1.0, 99.0, 2.0, np.nan, 4.0]))
+    np.testing.assert_array_equal(asked, [[1.0, 2.0, np.nan, 4.0]])
+    of_light.calibrated(photos, ("srgb",), None, False)
+    assert asked[1] is None
+
+
+@dataclass(frozen=True)
+class Photos:
+    """As much of `Photographs` as the calibration reads; a view is its number."""
+
+    views: list
+    gains: CameraGains
+    sensor: of_photographs.Sensor
+    log: SimpleNamespace
+
+    def number(self, view):
+        return view

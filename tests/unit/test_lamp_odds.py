@@ -20,6 +20,7 @@ from iif_core.light.emission.odds import (
 )
 from tests.unit.photographed_room import of_views, photographed
 from tests.workflow.light_room import LAMP, SIZE, Room, _quad
+from workflow.scene.light_files import emitter_columns
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -160,3 +161,16 @@ def test_probability_of_a_lamp_by_hand():
     np.testing.assert_array_equal(own.select(needed > 0).probability, own.probability[needed > 0])
     # An unseen object is not saturated, whatever its family is.
     assert replace(own, is_saturated=np.ones(6, bool)).probability[2] == own.probability[2]
+
+
+def test_evidence_stands_beside_its_emitters_in_the_table():
+    """Two emitters, one direction of the sky, one group that was left out: nothing is known of the last two."""
+    evidence = LampEvidence(np.array([True, False]), np.array([True, False]), np.array([False, True]), np.array([0.2, 0.1]))
+    zeros = np.zeros(4)
+    kept = zeros < 1
+    table = emitter_columns(zeros, zeros, np.zeros((4, 3)), np.zeros((4, 3)), zeros, kept, [""] * 4, evidence=evidence)
+    np.testing.assert_array_equal(table["probability"], [*evidence.probability, -1.0, -1.0])
+    for name in ("is_likely", "is_saturated", "is_hidden", "needed"):
+        assert table[name].tolist() == [*getattr(evidence, name).tolist(), *[0] * 2], name
+    nothing = emitter_columns(zeros, zeros, np.zeros((4, 3)), np.zeros((4, 3)), zeros, kept, [""] * 4)
+    assert (nothing["probability"] == -1.0).all() and not nothing["is_hidden"].any()

@@ -67,7 +67,7 @@ def _all_gains(start: CameraGains, number: np.ndarray, found: CalibratedResponse
         return replace(own, gain=np.where(own.estimated[:, None], own.gain, start.gain))
     gain, seen = start.gain.copy(), np.zeros(len(start.gain), bool)
     gain[number], seen[number] = found.gains.gain, found.gains.estimated
-    return replace(found.gains, gain=gain, estimated=seen)
+    return replace(found.gains, gain=gain, estimated=seen, group=None)
 
 
 def _shared_surface(photos: Photographs) -> PatchRows:
