@@ -241,8 +241,8 @@ def _(root):
 @case("two images of one name")
 def _(root):
     document = own.bare(root / "data/own")
-    document["frames"][1]["file_path"] = "more/000.png"
-    own.save_png(root / "data/own/more/000.png", np.zeros((48, 64, 3)))
+    document["frames"][1]["file_path"] = "images/000.jpg"
+    own.save_png(root / "data/own/images/000.jpg", np.zeros((48, 64, 3)))
     own.write_transforms(root / "data/own", document)
     return planned(root)
 
@@ -1051,7 +1051,7 @@ def _(root):
 
 
 case("mesh to put in: texture not there")(lambda root: put_in(gltf(root, images=[{"uri": "wood.png"}])))
-case("mesh to put in: compressed")(lambda root: put_in(gltf(root, extensionsRequired=["KHR_draco_mesh_compression"])))
+case("mesh to put in: compressed")(lambda root: put_in(gltf(root, extensionsRequired=["EXT_meshopt_compression"])))
 
 
 @case("mesh to put in: texture of emission")

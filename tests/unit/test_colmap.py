@@ -182,8 +182,8 @@ def test_refused_models(room, views, tmp_path):
     cameras(path, "1 OPENCV_FISHEYE 146 97 65.8 66.1 72.4 48.9 0 0 0 0")
     assert [f.name for f in listed(path).frames] == ["DSC00000", "DSC00001"]
     text = (place / "images.txt").read_text()
-    (place / "images.txt").write_text(text.replace("cam/DSC00001.JPG", "cam2/DSC00000.JPG"))
-    named(refused(path), "'cam/DSC00000.JPG'", "'cam2/DSC00000.JPG'", "view 'DSC00000'")
+    (place / "images.txt").write_text(text.replace("cam/DSC00001.JPG", "cam/DSC00000.png"))
+    named(refused(path), "'cam/DSC00000.JPG'", "'cam/DSC00000.png'", "view 'DSC00000'")
     (place / "images.txt").write_text("# empty\n")
     named(refused(path), "images.txt", "sparse/1")
     (place / "images.txt").write_text(text)

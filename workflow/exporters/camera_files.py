@@ -36,6 +36,7 @@ def cameras_json(
     up: Array,
     environment: dict[str, Any] | None = None,
     response: str | None = None,
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> bytes:
     """Return cameras.json in the form of nerfstudio's transforms.json, with what Blender needs in the block `blender`.
 
@@ -45,6 +46,7 @@ def cameras_json(
         up: (3,) unit vector of the world.
         environment: `mean_radiance`, and `map` where it is one; None = black.
         response: name of the lookup table of the camera's response; None = the photographs are linear.
+        origin: (3,) metres, in the coordinates of the input.
 
     `transform_matrix` is the camera-to-world matrix with OpenGL axes, in metres and in the axes of the capture; `fl_x, fl_y, cx,
     cy` are pixels, the centre of the first pixel at 0.5. `blender.world_to_blender` turns that world to the one that Blender's
@@ -73,7 +75,9 @@ def cameras_json(
     document = {
         "camera_model": "OPENCV",
         **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
-        "units": "metres; gain: factor on the radiance of scene.glb and emitters.parquet before the response",
+        "origin": _plain(np.asarray(origin, np.float64)),
+        "units": "metres, from `origin` in the coordinates of the input;"
+        " gain: factor on the radiance of scene.glb and emitters.parquet before the response",
         "blender": {
             "world_to_blender": _plain(world_to_blender(up)),
             "environment": environment,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import unicodedata
+from functools import lru_cache
+from pathlib import Path
 
 LONGEST = 180
 """Bytes of a name. File systems allow 255, and names of temporary files and of layers are added to it."""
@@ -33,6 +35,38 @@ def fault_of_name(name: str, longest: int = LONGEST) -> str:
 def same_name(name: str) -> str:
     """Return a form that is equal for names that some file systems take for one: upper and lower case, composed letters."""
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+def forward(path: str) -> str:
+    """Return a path with forward slashes, as programs on Windows write it with backslashes.
+
+    >>> forward(r".\\images\\0001.jpg")
+    './images/0001.jpg'
+    """
+    return path.replace("\\", "/")
+
+
+def existing(path: Path) -> Path:
+    """Return `path`, or where nothing is there the one file whose name differs in capital letters, or in how its letters are
+    composed, alone: such names come from systems that do not tell them apart."""
+    if path.exists() or path.parent == path:
+        return path
+    folder = existing(path.parent)
+    try:
+        stamp = folder.stat().st_mtime_ns if folder.is_dir() else None
+    except OSError:
+        stamp = None
+    found = _listed(folder, stamp).get(same_name(path.name), ()) if stamp is not None else ()
+    return folder / found[0] if len(found) == 1 else path
+
+
+@lru_cache(64)
+def _listed(folder: Path, _stamp: int) -> dict[str, tuple[str, ...]]:
+    out: dict[str, tuple[str, ...]] = {}
+    for entry in folder.iterdir():
+        name = same_name(entry.name)
+        out[name] = (*out.get(name, ()), entry.name)
+    return out
 
 
 def shown(value: object, longest: int = 80) -> str:

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from iif_core.errors import InputError
 from workflow.intake import limits
@@ -21,6 +21,7 @@ TEXTURES = (*FORMATS, "BMP", "TGA", "PPM")
 PNG_MAGIC = b"\x89PNG"
 EXR_MAGIC = b"\x76\x2f\x31\x01"
 _LARGEST_FILE = 4 << 30
+_LARGEST_CHUNK = 1 << 16
 
 
 def check_pixels(path: Path, width: int, height: int, channels: int = 1) -> None:
@@ -51,6 +52,19 @@ def check_chunks(path: Path) -> None:
                 raise InputError(f"{path}: cut short (no end mark: an interrupted copy or download?); copy the file again")
 
 
+def png_chunk(path: Path, wanted: bytes) -> bytes | None:
+    """Return the content of a chunk of a PNG that stands before its pixels; None without one, and of other files."""
+    with path.open("rb") as file:
+        if file.read(8)[:4] != PNG_MAGIC:
+            return None
+        while len(head := file.read(8)) == 8 and head[4:] not in (b"IDAT", b"IEND"):
+            length = int.from_bytes(head[:4], "big")
+            if head[4:] == wanted:
+                return file.read(min(length, _LARGEST_CHUNK))
+            file.seek(length + 4, 1)
+    return None
+
+
 @contextmanager
 def opened(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Any]:
     """Open a picture by Pillow, with its size checked; raises InputError for a size that is not allowed."""
@@ -73,8 +87,17 @@ def opened(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Any]:
             yield image
 
 
-def exr_size(path: Path) -> tuple[int, int]:
-    """Return width and height of an EXR from its header.
+class ExrWindows(NamedTuple):
+    """Sizes (width, height) of the pixels that an EXR holds and of the picture that it shows, and the place (x, y) of the first
+    pixel in that picture, which may lie outside (overscan)."""
+
+    data: tuple[int, int]
+    display: tuple[int, int]
+    place: tuple[int, int]
+
+
+def exr_windows(path: Path) -> ExrWindows:
+    """Return data and display window of an EXR from its header.
 
     Raises:
         InputError: no EXR, several parts, deep pixels, or more pixels or channels than are allowed.
@@ -89,16 +112,27 @@ def exr_size(path: Path) -> tuple[int, int]:
         if len(file.parts) != 1:
             raise InputError(f"{path}: {len(file.parts)} parts; an EXR of one part is needed")
         header = file.header()
-        low, high = header["dataWindow"]
-        width, height = int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1
+        (left, top), data = _corner_and_size(header["dataWindow"])
+        (x, y), display = _corner_and_size(header.get("displayWindow", header["dataWindow"]))
         channels = len(header["channels"])
         kind = header.get("type")
     if "deep" in str(kind).lower():
         raise InputError(f"{path}: deep pixels; flat ones are needed")
     if not 1 <= channels <= limits.PICTURE_CHANNELS:
         raise InputError(f"{path}: {channels} channels; allowed are 1 to {limits.PICTURE_CHANNELS}")
-    check_pixels(path, width, height, channels)
-    return width, height
+    for size in (data, display):
+        check_pixels(path, *size, channels)
+    return ExrWindows(data, display, (left - x, top - y))
+
+
+def _corner_and_size(window: Any) -> tuple[tuple[int, int], tuple[int, int]]:
+    (left, top), (right, bottom) = ([int(value) for value in corner] for corner in window)
+    return (left, top), (right - left + 1, bottom - top + 1)
+
+
+def exr_size(path: Path) -> tuple[int, int]:
+    """Return width and height of the pixels that an EXR holds; raises InputError as `exr_windows`."""
+    return exr_windows(path).data
 
 
 def exr_chromaticities(path: Path) -> tuple[float, ...] | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from iif_core.errors import InputError
 from iif_core.numerics.color import linear_from_srgb
 from workflow.intake import limits
 from workflow.intake.documents import reading
+from workflow.intake.gltf import plain_glb
 from workflow.intake.meshes import check_faces
 from workflow.intake.pictures import TEXTURES, check_pixels, check_texture
 from workflow.settings.mesh_files import emissive_strengths, files_of_mesh
@@ -64,7 +66,11 @@ def load_insert(path: Path) -> InsertedMesh:
 
     is_gltf = path.suffix.lower() in (".glb", ".gltf")
     with reading(path, "not readable as a mesh", "; export it again"):
-        loaded = trimesh.load_scene(str(path), process=False)
+        if is_gltf:
+            named = trimesh.resolvers.FilePathResolver(path)
+            loaded = trimesh.load_scene(BytesIO(plain_glb(path)), file_type="glb", resolver=named, process=False)
+        else:
+            loaded = trimesh.load_scene(str(path), process=False)
         parts = list(_parts(path, loaded, is_gltf))
         materials = [part[3] for part in parts]
         emitted = np.array([_emission(material, strengths) for material in materials])

@@ -5,26 +5,19 @@ This module checks the headers, before any job; `workflow.relighting.inserts` re
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
-from typing import Any
-from urllib.parse import unquote
 
 from iif_core.errors import InputError
-from workflow.intake import limits
-from workflow.intake.documents import check_file, read_bytes, reading, shorter
+from workflow.intake import gltf, limits
+from workflow.intake.documents import check_file, reading
 from workflow.intake.meshes import check_gltf, check_mesh
 from workflow.intake.names import shown
 from workflow.settings.names import did_you_mean_path
 
 MESHES = (".glb", ".gltf", ".ply", ".obj")
 """Files that can be put into a room."""
-_GLB_HEADER = struct.Struct("<4sII")
-_CHUNK_HEADER = struct.Struct("<II")
-_JSON_CHUNK = 0x4E4F534A
-_NOT_READ = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_texture_basisu", "EXT_texture_webp")
-"""Extensions of glTF without which a file that requires them cannot be shown as it is meant."""
+_SHOWN = ("KHR_materials_", "KHR_texture_transform", "KHR_lights_", "EXT_lights_", "KHR_xmp")
+"""How extensions of glTF begin that a file may require, beside those of geometry, and still be shown nearly as it is meant."""
 
 
 def files_of_mesh(path: Path) -> list[Path]:
@@ -37,9 +30,10 @@ def files_of_mesh(path: Path) -> list[Path]:
     if not check_file(path, limits.MESH_BYTES, "a mesh"):
         raise InputError(f"{path}: empty (0 bytes); export the mesh again, or copy it again")
     if kind in (".glb", ".gltf"):
-        document, size = _gltf(path)
+        document, _, size = gltf.document_of(path)
+        gltf.refuse_extensions(path, document, _SHOWN)
         with reading(path, "not readable as glTF", "; export the mesh again"):
-            named = _named_by_gltf(path, document)
+            named = gltf.named_files(path, document, _there)
             there = size + sum(file.stat().st_size for file in named)
             check_gltf(path, document, there)
             return [path, *named]
@@ -60,7 +54,7 @@ def emissive_strengths(path: Path) -> dict[str, float]:
     """
     if path.suffix.lower() not in (".glb", ".gltf"):
         return {}
-    document, _ = _gltf(path)
+    document = gltf.document_of(path)[0]
     found: dict[str, float] = {}
     with reading(path, "not readable as glTF", "; export the mesh again"):
         for material in document.get("materials", []):
@@ -75,64 +69,10 @@ def emissive_strengths(path: Path) -> dict[str, float]:
     return {name: strength for name, strength in found.items() if strength != 1.0}
 
 
-def _gltf(path: Path) -> tuple[dict[str, Any], int]:
-    """Return the document of a glTF file, and the bytes of the file."""
-    is_glb = path.suffix.lower() == ".glb"
-    data = read_bytes(path, limits.MESH_BYTES if is_glb else limits.DOCUMENT_BYTES, "a mesh")
-    return _json_of(path, _json_of_glb(path, data) if is_glb else data), len(data)
-
-
 def read_start(path: Path) -> bytes:
     """Return the first bytes of a file."""
     with reading(path, "cannot be read"), path.open("rb") as file:
         return file.read(16)
-
-
-def _json_of_glb(path: Path, data: bytes) -> bytes:
-    if len(data) < _GLB_HEADER.size + _CHUNK_HEADER.size or data[:4] != b"glTF":
-        raise InputError(f"{path}: no GLB file; it does not begin with `glTF`. Export the mesh again")
-    _, _, length = _GLB_HEADER.unpack_from(data)
-    if length > len(data):
-        raise InputError(
-            f"{path}: cut short (its header announces {length} bytes, it has {len(data)}); export it again, or copy it again"
-        )
-    size, kind = _CHUNK_HEADER.unpack_from(data, _GLB_HEADER.size)
-    start = _GLB_HEADER.size + _CHUNK_HEADER.size
-    if kind != _JSON_CHUNK:
-        raise InputError(f"{path}: no GLB file of version 2; its first part is not JSON. Export the mesh again")
-    at = _GLB_HEADER.size
-    while at < len(data):  # the reader asks for as much memory as the length of a part says, also behind the last
-        part = _CHUNK_HEADER.unpack_from(data, at)[0] if at + _CHUNK_HEADER.size <= len(data) else len(data)
-        at += _CHUNK_HEADER.size + part
-        if at > len(data):
-            raise InputError(f"{path}: damaged; one of its parts has {part} bytes, the file {len(data)}. Export the mesh again")
-    return data[start : start + size]
-
-
-def _json_of(path: Path, data: bytes) -> dict[str, Any]:
-    try:
-        document = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as glTF ({shorter(error)}); export the mesh again") from None
-    if not isinstance(document, dict) or "asset" not in document:
-        raise InputError(f"{path}: no glTF file; it has no `asset`. Export the mesh again")
-    needed = document.get("extensionsRequired", [])
-    refused = [name for name in needed if name in _NOT_READ] if isinstance(needed, list) else []
-    if refused:
-        raise InputError(f"{path}: needs the glTF extension {refused[0]}, which is not read; export the mesh without compression")
-    return document
-
-
-def _named_by_gltf(path: Path, document: dict[str, Any]) -> list[Path]:
-    found = []
-    for part, what in (("buffers", "buffer"), ("images", "texture")):
-        for entry in document.get(part, []):
-            uri = entry.get("uri", "")
-            if uri and not uri.startswith("data:"):
-                if len(uri) > limits.TEXT:
-                    raise InputError(f"{path}: the path of a {what} has {len(uri)} characters (allowed {limits.TEXT})")
-                found.append(_there(path, path.parent / unquote(uri), what))
-    return found
 
 
 def _named_by_obj(path: Path) -> list[Path]:

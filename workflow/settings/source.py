@@ -28,9 +28,15 @@ class PhotographedSource(Section):
     registration: Annotated[Literal["auto", "off"], ON_OFF] = "auto"
     """`auto`: correct poses, focal length and principal point by the mesh and the other photographs, if held-out surface confirms
     the correction, and leave out blurred and badly posed photographs. `off`: use them as given."""
+    borders: Literal["leave_out", "keep"] = "leave_out"
+    """`leave_out`: black pixels that hang together with the edge in most photographs are no surface: borders of photographs whose
+    distortion was removed without cropping, letterboxes."""
     close_holes: float = Field(0.5, ge=0)
     """Close holes of the mesh up to so many metres across, where the filling continues the surface around; 0: leave them open.
     Through a hole light is lost, and comes in that was never there."""
+    colour: Literal["file", "srgb", "linear", "display_p3", "adobe_rgb", "rec2020", "acescg"] = "file"
+    """Colour space of the photographs: as each file says, or one for all, whatever they say. Of EXR files, which are linear, it
+    gives the primaries."""
     mesh_up: Literal["as_poses", "y", "z"] | str = "as_poses"
     """How the mesh file is turned against the poses: `y`: it has y up and they have z up (as a GLB of a room with z up), `z`: the
     other way round. Any other quarter turn: the x, y and z of the poses, as axes of the mesh file, such as `z x y`."""

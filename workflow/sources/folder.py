@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from workflow.scene.normal_form import CaptureWriter, View
 from workflow.settings.source import mesh_axes
 from workflow.sources.folder_scene import (
     alignment,
+    borders,
     exposure,
     held_out,
     images,
@@ -34,7 +35,7 @@ from workflow.sources.folder_scene import (
     transforms,
 )
 from workflow.sources.folder_scene.inputs import Inputs, find_inputs
-from workflow.sources.folder_scene.photographs import Photograph, photograph, pinhole, view_of
+from workflow.sources.folder_scene.photographs import Photograph, decoded, photograph, pinhole, view_of
 from workflow.sources.folder_scene.room import Room
 from workflow.sources.folder_scene.transforms import Frame
 
@@ -61,17 +62,27 @@ def capture(job: Job) -> None:
 
 def capture_photographs(job: Job, inputs: Inputs) -> None:
     """Write the normal form of photographs with known cameras and a mesh, whichever source found them."""
-    source, settings, frames = job.settings.source, job.settings.capture, inputs.transforms.frames
+    source, settings = job.settings.source, job.settings.capture
     conventions = alignment.Conventions(inputs.transforms.axes, inputs.metres, mesh_axes=mesh_axes(source.mesh_up))
+    surface = _mesh(inputs, source)
+    origin = surface.origin
+    inputs, surface = inputs.from_origin(origin), surface.from_origin(origin)
+    frames = inputs.transforms.frames
     poses = [conventions.pose(frame) for frame in frames]
-    surface = _mesh(inputs, source, poses)
-    said = [*inputs.transforms.notes, *surface.notes]
+    centres = np.array([pose[:3, 3] for pose in poses])
+    mesh.check_size(inputs.mesh, surface, getattr(source, "unit", "m"), inputs.metres, centres)
+    surface = surface.closed(source.close_holes)
+    said = [*inputs.transforms.notes, *surface.notes, *notes.of_origin(origin)]
     exposures, words = exposure.given(inputs.exposures, frames, settings.exposure)
     said += words
     task = _Task(inputs, source, settings, conventions, Room.of(surface, job.threads))
     held, decision = _held_out(task, poses)
     task, names = replace(task, splits=held.split), [frame.name for frame in frames]
     said += held.notes(names)
+    if source.borders == "leave_out":
+        own = [frame for frame, split in zip(frames, held.split, strict=True) if split != "test"]
+        task = replace(task, borders=borders.find_borders(own, task.encoded, decoded))
+        said += borders.notes_of(task.borders)
     posed, forms = _registered(job, task, poses, exposures)
     said += [*posed.notes, *(f"view {name} left out: {reason}" for name, reason in posed.left_out.items())]
 
@@ -90,12 +101,13 @@ def capture_photographs(job: Job, inputs: Inputs) -> None:
     said += notes.of_pixels(posed.frames, taken.counts, [*forms, *taken.forms])
     said += notes.of_views(posed.frames, views, task.listed, settings.test_every, task.encoded)
     said += notes.of_objects(posed.frames, surface, inputs.mesh.name)
-    _write(job, task, posed, taken, views, surface, said, held.facts(names), decision)
+    _write(job, task, posed, taken, views, surface, said, held.facts(names), decision, origin)
 
 
 @dataclass(frozen=True)
 class _Task:
-    """What the photographs of a scene are taken with; `splits`: `train` or `test` for each frame, once that is known."""
+    """What the photographs of a scene are taken with; `splits`: `train` or `test` for each frame, once that is known; `borders`:
+    of the photographs of each size that have one."""
 
     inputs: Inputs
     source: Any
@@ -103,6 +115,7 @@ class _Task:
     conventions: alignment.Conventions
     room: Room
     splits: Sequence[str] = ()
+    borders: Mapping[borders.Size, np.ndarray] = field(default_factory=dict)
 
     @property
     def encoded(self) -> bool:
@@ -118,6 +131,11 @@ class _Task:
         """Return the names of at most `count` frames, evenly spread."""
         frames = self.inputs.transforms.frames
         return {frames[i].name for i in transforms.evenly_spread(len(frames), count)}
+
+    def photograph(self, frame: Frame, view: View, gain: float) -> Photograph:
+        """Decode the photograph of a frame at the size of its view."""
+        border = self.borders.get((frame.camera.width, frame.camera.height))
+        return photograph(frame, view, self.encoded, gain, border)
 
     def view(self, frame: Frame, pose: np.ndarray, number: int, gain: float, longest: float = np.inf) -> View:
         """Return the camera of a frame in the size of the capture, or `longest` if that is less."""
@@ -152,14 +170,12 @@ class _Taken:
     notes: list[str]
 
 
-def _mesh(inputs: Inputs, source: Any, poses: Sequence[np.ndarray]) -> mesh.Mesh:
+def _mesh(inputs: Inputs, source: Any) -> mesh.Mesh:
     of_vertices = inputs.of_vertices() if inputs.of_vertices else None
     found = mesh.load(inputs.mesh, inputs.metres, of_vertices, mesh_axes(source.mesh_up))
-    centres = np.array([pose[:3, 3] for pose in poses])
-    mesh.check_size(inputs.mesh, found, getattr(source, "unit", "m"), inputs.metres, centres)
     if found.from_nodes and any(frame.ids for frame in inputs.transforms.frames):
         found = replace(found, instance=None, names=None)
-    return found.closed(source.close_holes)
+    return found
 
 
 def _held_out(task: _Task, poses: Sequence[np.ndarray]) -> tuple[held_out.HeldOut, list[Decision]]:
@@ -211,7 +227,7 @@ def _registered(
         photos.append(None)
         if (face >= 0).mean() < MIN_COVERAGE:
             continue
-        one = photograph(frame, view, task.encoded, gains[i])
+        one = task.photograph(frame, view, gains[i])
         held = task.splits[i] == "test"
         forms += [(one.form, frame.name)] * bool(one.form and not held)
         camera = (view.fx, view.fy), (view.cx, view.cy), pose
@@ -235,7 +251,7 @@ def _take(job: Job, task: _Task, posed: registration.Registered, gains: list[flo
             out.dropped[frame.name] = share
             out.blind.append((frame, view))
             continue
-        one = photograph(frame, view, task.encoded, gains[i])
+        one = task.photograph(frame, view, gains[i])
         seen = one.without_black(task.encoded)
         writer.gbuffer(view.name, depth, face)
         _write_photograph(task, writer, frame, view, seen, face)
@@ -286,7 +302,7 @@ def _estimated(task: _Task, taken: _Taken, writer: CaptureWriter) -> tuple[list[
         return [replace(v, exposure=gain[v.view_id]) if v.view_id in gain else v for v in taken.views], words
     for i, gain in zip(own, found.gain, strict=True):
         frame, view = taken.frames[i], taken.views[i]
-        one = photograph(frame, view, task.encoded, float(gain)).without_black(task.encoded)
+        one = task.photograph(frame, view, float(gain)).without_black(task.encoded)
         _write_photograph(task, writer, frame, view, one, task.room.seen(view)[1])
     return taken.views, words
 
@@ -301,6 +317,7 @@ def _write(
     said: list[str],
     held: dict[str, object],
     decided: list[Decision],
+    origin: np.ndarray,
 ) -> None:
     writer = CaptureWriter(job.writer)
     writer.cameras(views)
@@ -311,6 +328,7 @@ def _write(
         "left_out_views": posed.left_out,
         "registration": posed.facts,
         "plan": [*posed.plan, *decided],
+        "origin": origin.tolist(),
         "exposure_estimated": task.settings.exposure == "estimate",
         "stated_exposure": _stated(task, posed.frames),
         **({"held_out": held} if held else {}),
@@ -364,7 +382,7 @@ def _sees_nothing(task: _Task, taken: _Taken) -> str:
     better = _better_depth(task, taken.blind)
     if not better:
         seen = [(f, v) for f, v in taken.blind if f.name in tried and v.split != "test"]
-        better = _better_edges(task, [_trial(f, v, photograph(f, v, task.encoded, 1.0)) for f, v in seen], 0.0)
+        better = _better_edges(task, [_trial(f, v, task.photograph(f, v, 1.0)) for f, v in seen], 0.0)
     listed = task.inputs.transforms
     return (
         f"{listed.path}: none of {len(listed.frames)} cameras sees {task.inputs.mesh.name} (rays that"

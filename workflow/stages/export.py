@@ -90,7 +90,7 @@ def _camera_files(job: Job, capture: CaptureReader, environment: np.ndarray) -> 
         note = note | {"map": "environment.exr"}
         job.writer.exr("environment.exr", split_rgb(camera_files.environment_picture(environment)), "relative")
     gains = job.read("emission").json("emission.json")["gain"]
-    job.writer.bytes(
-        "cameras.json", camera_files.cameras_json(capture.views, names, np.asarray(gains), capture.up, note, response)
-    )
+    origin = capture.facts.get("origin") or (0.0, 0.0, 0.0)
+    cameras = camera_files.cameras_json(capture.views, names, np.asarray(gains), capture.up, note, response, origin)
+    job.writer.bytes("cameras.json", cameras)
     job.writer.bytes(camera_files.SCRIPT, camera_files.script())

@@ -18,7 +18,7 @@ from iif_core.camera.distortion import distort
 from iif_core.errors import InputError
 from workflow.intake import limits
 from workflow.intake.documents import check_file, reading
-from workflow.intake.names import shown
+from workflow.intake.names import existing, forward, shown
 from workflow.sources.folder_scene import transforms
 from workflow.sources.folder_scene.images import EXTENSIONS
 from workflow.sources.folder_scene.transforms import Entry, Transforms
@@ -175,7 +175,7 @@ def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[s
     entries = [entry_of(model, image) for image in model.images]
     masks = folder / "masks"
     # COLMAP's own form of the name; 0001.png would be a mask of objects (docs/guide/segmentation.md).
-    named = {entry.file_path: masks / f"{entry.file_path}.png" for entry in entries}
+    named = {entry.file_path: existing(masks / f"{entry.file_path}.png") for entry in entries}
     entries = [replace(entry, mask=named[entry.file_path]) if named[entry.file_path].is_file() else entry for entry in entries]
     listed = transforms.frames_of(model.path, {}, entries, root, source, capture)
     if points:
@@ -249,7 +249,7 @@ def _pose(quaternion: Any, translation: Any) -> np.ndarray:
 
 def _image(name: str, camera: int, values: Any, xy: np.ndarray, ids: np.ndarray) -> Image:
     tracked = ids >= 0
-    return Image(name, camera, _pose(values[:4], values[4:7]), xy[tracked], ids[tracked])
+    return Image(forward(name), camera, _pose(values[:4], values[4:7]), xy[tracked], ids[tracked])
 
 
 # ------------------------------------------------------------------------------------------------------------------ text
@@ -257,7 +257,7 @@ def _image(name: str, camera: int, values: Any, xy: np.ndarray, ids: np.ndarray)
 
 def _lines(path: Path) -> Iterator[str]:
     """Yield the lines without comments, one at a time because these files hold every keypoint of every image."""
-    with open(path, encoding="utf-8") as file:
+    with open(path, encoding="utf-8-sig") as file:
         for line in file:
             if not line.startswith("#"):
                 yield line.strip()

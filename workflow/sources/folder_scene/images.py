@@ -14,8 +14,8 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.intake.documents import reading
-from workflow.intake.pictures import exr_chromaticities, exr_size, opened
-from workflow.sources.folder_scene.profiles import converted, linear_conversion, refuse_other
+from workflow.intake.pictures import exr_chromaticities, exr_windows, opened
+from workflow.sources.folder_scene.profiles import SPACES, Space, converted, linear_conversion, of_16_bits
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr")
 STRIP_PIXELS = 1 << 20
@@ -48,11 +48,13 @@ class Stated(NamedTuple):
 
 @dataclass(frozen=True)
 class Header:
-    """Size (width, height) as stored, EXIF orientation 1 ... 8 (1 = upright), and the exposure that EXIF states."""
+    """Size (width, height) as stored, of an EXR that of its display window, EXIF orientation 1 ... 8 (1 = upright), the exposure
+    that EXIF states, and the size of the data window of an EXR."""
 
     size: tuple[int, int]
     orientation: int = 1
     stated: Stated | None = None
+    data: tuple[int, int] | None = None
 
 
 @dataclass
@@ -62,7 +64,7 @@ class Photo:
     Attributes:
         pixels: (H, W, 3) float32 sensor values in [0, 1], or radiance.
         valid: (H, W) bool.
-        non_finite, transparent, negative, masked: counts of such pixels.
+        non_finite, transparent, negative, masked, outside: counts of such pixels; outside: of the data window of an EXR.
         form: format of the file other than 8-bit colour (`grey`, `16-bit`, `16-bit grey`), or the colour space from which it was
             converted (`in Display P3`), else empty.
     """
@@ -73,13 +75,15 @@ class Photo:
     transparent: int = 0
     negative: int = 0
     masked: int = 0
+    outside: int = 0
     form: str = ""
 
 
 @lru_cache(4096)
 def _header(path: Path, _stamp: tuple[int, int]) -> Header:
     if path.suffix.lower() == ".exr":
-        return Header(exr_size(path))
+        windows = exr_windows(path)
+        return Header(windows.display, data=windows.data)
     with reading(path, "not a readable image"):
         with opened(path) as image:
             if image.mode not in MODES:
@@ -141,41 +145,72 @@ def _is_16_bit_png(path: Path) -> bool:
 
 def _stored(path: Path) -> np.ndarray:
     """Read the pixels of a png or jpg, (H, W) or (H, W, C), integer, as they are; palettes are resolved."""
-    return _pixels_of(path, colour=False)[0]
+    return _pixels_of(path, colour=None)[0]
 
 
-def _pixels_of(path: Path, colour: bool) -> tuple[np.ndarray, str]:
-    """Read the pixels of a png or jpg, (H, W) or (H, W, C), integer; with `colour` in sRGB, and from which colour space."""
+def _pixels_of(path: Path, colour: str | None) -> tuple[np.ndarray, str, Space | None]:
+    """Read the pixels of a png or jpg, (H, W) or (H, W, C), integer.
+
+    With a `colour` (`source.colour`) also from which colour space they were, or are still to be, converted to sRGB, and that
+    space in the latter case.
+    """
     header(path)
     with reading(path, "cannot be read", "; the file is damaged or cut short"):
+        given = SPACES.get(colour or "")
+        is_srgb = colour == "srgb"
         if _is_16_bit_png(path):  # Pillow truncates 16-bit colour to 8 bits
             import mitsuba as mi
 
-            if colour:
+            space = given
+            if colour == "file":
                 with opened(path) as image:
-                    refuse_other(image, path)
-            return np.array(mi.Bitmap(str(path))), ""
+                    space = of_16_bits(image, path)
+            name = "" if space is None or is_srgb else f"in {space.name}"
+            return np.array(mi.Bitmap(str(path))), name, None if is_srgb else space
         with opened(path) as image:
-            space = ""
+            name = ""
             if image.mode in ("P", "PA"):
                 image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
             elif image.mode == "1":
                 image = image.convert("L")
-            if colour:
-                image, space = converted(image, path)
-            return np.asarray(image), f"in {space}" if space else ""
+            space = None
+            if colour == "file":
+                image, name, space = converted(image, path)
+            elif given is not None and not is_srgb:
+                name, space = given.name, given
+            return np.asarray(image), f"in {name}" if name else "", space
 
 
-def _exr(path: Path) -> dict[str, np.ndarray]:
-    """Read the channels of an EXR, all of the size that its header states."""
+def _exr(path: Path, whole: bool = False) -> dict[str, np.ndarray]:
+    """Read the channels of an EXR in its display window; where it holds no pixels they are NaN, or the largest integer. With
+    `whole` all pixels that it holds, wherever they are shown."""
     from workflow.artifacts.files import read_exr
 
-    width, height = header(path).size
+    windows = exr_windows(path)
+    (width, height), (x, y) = windows.data, windows.place
     with reading(path, "cannot be read", "; the file is damaged, cut short or has several parts"):
         channels = read_exr(path)
         if any(values.shape != (height, width) for values in channels.values()):
             raise InputError(f"{path}: channels of different sizes (subsampled?); write all of them at full size")
-        return channels
+        if whole or (windows.data == windows.display and windows.place == (0, 0)):
+            return channels
+        shown = windows.display[0], windows.display[1]
+        columns, rows = slice(max(x, 0), max(min(x + width, shown[0]), 0)), slice(max(y, 0), max(min(y + height, shown[1]), 0))
+        out = {}
+        for name, values in channels.items():
+            none = np.nan if values.dtype.kind == "f" else np.iinfo(values.dtype).max
+            out[name] = np.full(shown[::-1], none, values.dtype)
+            out[name][rows, columns] = values[rows.start - y : rows.stop - y, columns.start - x : columns.stop - x]
+        return out
+
+
+def _not_held(path: Path) -> int:
+    """Return the number of pixels of the display window of an EXR that it does not hold."""
+    windows = exr_windows(path)
+    held = 1
+    for size, shown, at in zip(windows.data, windows.display, windows.place, strict=True):
+        held *= max(min(at + size, shown) - max(at, 0), 0)
+    return windows.display[0] * windows.display[1] - held
 
 
 def _colours(path: Path, channels: dict[str, np.ndarray]) -> list[str]:
@@ -195,19 +230,23 @@ def _exr_colour(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
     return np.stack([channels[name].astype(np.float32) for name in _colours(path, channels)], -1)
 
 
-def load_photo(path: Path, turn: int = 1) -> Photo:
-    """Read a photograph: 8 or 16 bits become [0, 1], EXR values stay, grey becomes RGB.
+def load_photo(path: Path, turn: int = 1, whole: bool = False, colour: str = "file") -> Photo:
+    """Read a photograph: 8 or 16 bits become [0, 1], EXR values stay, grey becomes RGB. Of an EXR the display window is read, or
+    with `whole` the data window.
 
-    Colours of another space, by the colour profile of the file or the primaries of an EXR, are converted to sRGB.
+    Colours of another space, by the profile, the chunks or the EXIF of the file, or the primaries of an EXR, are converted to
+    sRGB; a `colour` other than `file` is the space whatever the file says (`source.colour`).
     Pixels with alpha < 0.5 and those that are NaN or infinite are not valid and become 0. EXR stores colour multiplied by alpha,
     so it is divided by alpha. Negative EXR values become 0.
     """
-    form = ""
+    form, outside = "", 0
     if path.suffix.lower() == ".exr":
-        found = _exr(path)
+        found, outside = _exr(path, whole), 0 if whole else _not_held(path)
         names = _colours(path, found)
         height, width = found[names[0]].shape
-        to_rec709 = linear_conversion(exr_chromaticities(path), path) if names[0] != names[1] else None
+        stated = SPACES[colour].primaries if colour in SPACES else None
+        points = exr_chromaticities(path) if stated is None else tuple(np.ravel(stated))
+        to_rec709 = linear_conversion(points, path) if names[0] != names[1] else None
         form = "of other primaries" if to_rec709 is not None else ""
 
         def strip(rows: slice) -> tuple[np.ndarray, np.ndarray | None]:
@@ -219,29 +258,32 @@ def load_photo(path: Path, turn: int = 1) -> Photo:
             alpha = values[..., 3]
             return values[..., :3] / np.where(np.isfinite(alpha) & (alpha >= 0.5), np.minimum(alpha, 1), 1)[..., None], alpha
     else:
-        stored, space = _pixels_of(path, colour=True)
+        stored, name, space = _pixels_of(path, colour)
         stored = stored[..., None] if stored.ndim == 2 else stored
         if stored.ndim != 3 or stored.dtype.kind not in "iu":
             raise InputError(f"{path}: pixels of type {stored.dtype}, shape {stored.shape}; expected 8 or 16 bits")
         height, width, channels = stored.shape
-        form = " ".join(["16-bit"] * (stored.dtype.itemsize > 1) + ["grey"] * (channels < 3)) or space
+        space = space if channels >= 3 else None
+        form = " ".join(["16-bit"] * (stored.dtype.itemsize > 1) + ["grey"] * (channels < 3) + [name] * bool(name))
 
         def strip(rows: slice) -> tuple[np.ndarray, np.ndarray | None]:
             values = stored[rows].astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
-            colour = values[..., :3] if channels >= 3 else np.repeat(values[..., :1], 3, -1)
-            return colour, values[..., -1] if channels in (2, 4) else None
+            shown = values[..., :3] if channels >= 3 else np.repeat(values[..., :1], 3, -1)
+            shown = shown if space is None else space.to_srgb(shown)
+            return shown, values[..., -1] if channels in (2, 4) else None
 
     photo = Photo(np.empty((height, width, 3), np.float32), np.empty((height, width), bool), form=form)
     step = max(1, STRIP_PIXELS // width)
     for rows in (slice(top, top + step) for top in range(0, height, step)):
-        colour, alpha = strip(rows)
-        finite = np.isfinite(colour).all(-1) & (np.isfinite(alpha) if alpha is not None else True)
+        values, alpha = strip(rows)
+        finite = np.isfinite(values).all(-1) & (np.isfinite(alpha) if alpha is not None else True)
         opaque = np.ones(finite.shape, bool) if alpha is None else np.nan_to_num(alpha) >= 0.5
-        colour = np.where(finite[..., None], colour, 0)
-        photo.pixels[rows], photo.valid[rows] = np.maximum(colour, 0), finite & opaque
+        values = np.where(finite[..., None], values, 0)
+        photo.pixels[rows], photo.valid[rows] = np.maximum(values, 0), finite & opaque
         photo.non_finite += int((~finite).sum())
         photo.transparent += int((finite & ~opaque).sum())
-        photo.negative += int((colour.min(-1) < 0).sum())
+        photo.negative += int((values.min(-1) < 0).sum())
+    photo.non_finite, photo.outside = photo.non_finite - outside, outside  # what an EXR does not hold was read as NaN
     photo.pixels, photo.valid = TURNS[turn](photo.pixels), TURNS[turn](photo.valid)
     return photo
 

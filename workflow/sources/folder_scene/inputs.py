@@ -41,6 +41,26 @@ class Inputs:
     response: np.ndarray | None = None
     also: tuple[Path, ...] = ()
 
+    def from_origin(self, origin: np.ndarray) -> Inputs:
+        """Return the inputs with all positions relative to an origin (3,), metres."""
+        if not origin.any():
+            return self
+        own = origin / self.metres
+
+        def moved(matrix: np.ndarray | None) -> np.ndarray | None:
+            return None if matrix is None else matrix - np.pad(own[:, None], ((0, 1), (3, 0)))
+
+        frames = tuple(
+            replace(
+                frame,
+                matrix=moved(frame.matrix),
+                depth_matrix=moved(frame.depth_matrix),
+                seen=None if frame.seen is None else frame.seen - own,
+            )
+            for frame in self.transforms.frames
+        )
+        return replace(self, transforms=replace(self.transforms, frames=frames))
+
     def files(self) -> list[Path]:
         """List all files."""
         out = [self.transforms.path, self.mesh, *([self.exposures] if self.exposures else [])]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,10 @@ from iif_core.surface.holes import close_holes
 from iif_core.surface.triangles import face_geometry
 from workflow.intake import limits
 from workflow.intake.documents import check_file, reading
+from workflow.intake.gltf import plain_glb
 from workflow.intake.meshes import AGAIN, check_faces, check_mesh
-from workflow.settings.mesh_files import files_of_mesh
+from workflow.intake.obj import read_obj
+from workflow.intake.ply import read_ply
 from workflow.settings.names import did_you_mean_path
 from workflow.sources.folder_scene.transforms import METRES
 
@@ -30,6 +33,9 @@ LEAST_SPREAD = 0.05  # of the scene's size; cameras nearer to one another lie in
 MAX_UNUSED = 0.05
 """Share of the vertices of an OBJ file that may belong to no face; one that is cut short has vertices first, and then part of the
 faces."""
+FARTHEST = 1000.0
+"""Metres from the origin beyond which an origin of the scene's own is subtracted: single precision, in which rays are traced, is
+0.06 mm there, and half a metre where projected coordinates of a map are."""
 TYPICAL_DIAGONAL = 7.0  # metres; the unit that comes nearest to it is proposed
 
 
@@ -62,6 +68,16 @@ class Mesh:
         faces = np.concatenate([self.faces, found.faces.astype(self.faces.dtype)])
         instance = None if self.instance is None else np.concatenate([self.instance, self.instance[found.beside]])
         return replace(self, faces=faces, instance=instance, notes=[*self.notes, note])
+
+    def from_origin(self, origin: np.ndarray) -> Mesh:
+        """Return the mesh relative to an origin (3,), metres."""
+        return replace(self, vertices=self.vertices - origin) if origin.any() else self
+
+    @property
+    def origin(self) -> np.ndarray:
+        """(3,) what to subtract, whole metres: the middle of a mesh with coordinates beyond `FARTHEST`, else 0."""
+        is_far = np.abs(self.bounds).max() > FARTHEST
+        return np.round(self.bounds.mean(0)) if is_far else np.zeros(3)
 
     @property
     def bounds(self) -> np.ndarray:
@@ -185,20 +201,24 @@ def majority_id(ids: np.ndarray) -> np.ndarray:
 
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, list[str] | None]:
-    import trimesh
-
+    """Return vertices, faces, the objects of the faces and, where these are nodes of the file, their names."""
     _refuse_empty(path)
     check_mesh(path)
     _refuse_cut(path)
-    if path.suffix.lower() == ".glb":
-        files_of_mesh(path)
     with reading(path, "cannot be read as a mesh", f"; it is damaged or cut short: {AGAIN}"):
-        scene = trimesh.load_scene(path, process=False, maintain_order=True)
-        return _merged(path, scene)
+        if path.suffix.lower() == ".ply":
+            vertices, faces, ids = read_ply(path)
+            return vertices, faces, None if ids is None else _whole(path, ids), None
+        if path.suffix.lower() == ".obj":
+            return *read_obj(path), None, None
+        import trimesh
+
+        # glTF has one precision, so nothing is lost on the way through it.
+        return _merged(path, trimesh.load_scene(BytesIO(plain_glb(path)), file_type="glb", process=False, maintain_order=True))
 
 
 def _merged(path: Path, scene: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, list[str] | None]:
-    """Return vertices, faces, the objects of the faces and their names of a scene of trimesh."""
+    """Return the same of a scene of Trimesh."""
     import trimesh
 
     vertices, faces, nodes, names, offset, count = [], [], [], [], 0, 0
@@ -220,28 +240,14 @@ def _merged(path: Path, scene: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray 
         offset += len(v)
     if not faces:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64), None, None
-    v, f = np.concatenate(vertices), np.concatenate(faces)
-    if path.suffix.lower() == ".ply":
-        (part,) = scene.geometry.values()
-        return v, f, _face_property(path, part, len(f)), None
-    if len(names) > 1 and path.suffix.lower() == ".glb":
-        return v, f, np.concatenate(nodes), names
-    return v, f, None, None
+    own = (np.concatenate(nodes), names) if len(names) > 1 else (None, None)
+    return np.concatenate(vertices), np.concatenate(faces), *own
 
 
-def _face_property(path: Path, part: Any, count: int) -> np.ndarray | None:
-    """Return the `instance` property of the faces of a PLY, or None."""
-    data = part.metadata.get("_ply_raw", {}).get("face", {}).get("data")
-    names = data.dtype.names if isinstance(data, np.ndarray) else data.keys() if isinstance(data, dict) else ()
-    if "instance" not in (names or ()):
-        return None
-    values = np.asarray(data["instance"])
-    values = values["f1"] if values.dtype.names else values
-    values = values.reshape(-1).astype(np.float64)
-    if len(values) != count:
-        raise InputError(f"{path}: `instance` of {len(values)} polygons, {count} triangles; triangulate the mesh first")
+def _whole(path: Path, values: np.ndarray) -> np.ndarray:
+    """Return the `instance` property of faces as integers, -1 = none."""
     whole = np.rint(np.where(np.isfinite(values), values, -1))
-    if (np.abs(values - whole) > 1e-3).any():
+    if (np.abs(values - whole)[np.isfinite(values)] > 1e-3).any():
         raise InputError(f"{path}: `instance` holds numbers between integers; ids must be integers")
     return np.where(whole < 0, -1, whole).astype(np.int64)
 
@@ -254,6 +260,9 @@ def _cleaned(path: Path, vertices: np.ndarray, faces: np.ndarray, ids: np.ndarra
         notes.append(f"mesh: {int((~finite).sum())} faces with NaN vertices removed")
     if (finite & ~kept).any():
         notes.append(f"mesh: {int((finite & ~kept).sum())} zero-area triangles removed")
+    kept, doubled = _first_of_doubled(vertices, faces, kept)
+    if doubled:
+        notes.append(f"mesh: {doubled} faces that lie on another one removed (two-sided export?)")
     if not kept.any():
         raise InputError(
             f"{path}: none of {len(faces)} triangles has an area above {MIN_AREA:g} m^2; if it is a good mesh, its unit"
@@ -264,6 +273,18 @@ def _cleaned(path: Path, vertices: np.ndarray, faces: np.ndarray, ids: np.ndarra
         share = 1 - len(used) / len(vertices)
         notes.append(f"WARNING {share:.0%} of the vertices of {path.name} belong to no face: is the file cut short?")
     return Mesh(vertices[used], faces.reshape(-1, 3).astype(np.int32), None if ids is None else ids[kept], notes=notes)
+
+
+def _first_of_doubled(vertices: np.ndarray, faces: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, int]:
+    """Keep (m,) bool one of the faces whose three corners lie in the same places, and count the others."""
+    own = np.flatnonzero(kept)
+    used, index = np.unique(faces[own], return_inverse=True)
+    place = np.unique(vertices[used], axis=0, return_inverse=True)[1].reshape(-1)
+    corners = np.sort(place[index.reshape(-1, 3)], 1)
+    first = np.unique(corners, axis=0, return_index=True)[1]
+    out = np.zeros(len(kept), bool)
+    out[own[first]] = True
+    return out, len(own) - len(first)
 
 
 def _renumbered(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

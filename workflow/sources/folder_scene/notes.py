@@ -24,6 +24,14 @@ def of_dropped(dropped: Mapping[str, float], count: int) -> list[str]:
     return out
 
 
+def of_origin(origin: np.ndarray) -> list[str]:
+    """Say which origin (3,) was subtracted, if one was."""
+    if not origin.any():
+        return []
+    at = ", ".join(f"{value:.0f}" for value in origin)
+    return [f"coordinates are far from 0: all that is written is relative to ({at}) m, `origin` in capture.json and cameras.json"]
+
+
 def of_blank(path: Path, blank: Mapping[str, list[str]], count: int) -> list[str]:
     """Name the photographs, of `count`, that are black or white all over.
 
@@ -75,6 +83,7 @@ def of_pixels(frames: Sequence[Frame], counts: Mapping[str, int], forms: Sequenc
         "non_finite": "NaN or infinite pixels are ignored",
         "transparent": "transparent pixels are ignored (alpha < 0.5)",
         "negative": "pixels with negative values were set to 0",
+        "outside": "pixels of the display window that the EXR does not hold are ignored",
         "masked": f"masked pixels are ignored ({sum(f.mask is not None for f in frames)} masks)",
     }
     out = [f"photographs: {counts[k]} {text}" for k, text in words.items() if counts[k]]

@@ -18,7 +18,7 @@ from workflow.sources.folder_scene.transforms import Frame
 
 BLACK, WHITE = 2.5 / 255, 253.5 / 255  # sensor values of all channels below and above which a pixel tells nothing about the light
 EVERYWHERE = 0.999  # share of such pixels that makes a photograph black or white
-COUNTED = ("non_finite", "transparent", "negative", "masked")
+COUNTED = ("non_finite", "transparent", "negative", "masked", "outside")
 
 
 @dataclass(frozen=True)
@@ -61,19 +61,32 @@ def view_of(
     return View(view_id, frame.name, *intrinsics, pose, exposure, split)
 
 
-def photograph(frame: Frame, view: View, encoded: bool, gain: float) -> Photograph:
+def decoded(frame: Frame) -> images.Photo:
+    """Read a photograph as its file has it.
+
+    Raises:
+        InputError: it cannot be read, or is not of the size that its header says.
+    """
+    photo = images.load_photo(frame.image, frame.turn, frame.whole, frame.colour)
+    _upright(frame, frame.image, photo.pixels)
+    return photo
+
+
+def photograph(frame: Frame, view: View, encoded: bool, gain: float, border: np.ndarray | None = None) -> Photograph:
     """Decode a photograph, undistorted and reduced by area.
 
     Args:
         frame: the files.
         view: the camera whose picture is made.
         encoded: the values are sensor values; else they are radiance, which is divided by `gain`, the exposure.
+        border: (H, W) bool of the file, pixels without a picture.
 
     Raises:
         InputError: the photograph or its mask cannot be read, or they differ in size.
     """
-    photo = images.load_photo(frame.image, frame.turn)
-    _upright(frame, frame.image, photo.pixels)
+    photo = decoded(frame)
+    if border is not None:
+        photo.valid &= ~border
     if frame.mask is not None:
         kept = _upright(frame, frame.mask, images.load_mask(frame.mask, frame.turn, frame.mask_full))
         photo.masked = int((photo.valid & ~kept).sum())

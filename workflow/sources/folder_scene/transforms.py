@@ -20,7 +20,7 @@ from iif_core.camera.distortion import Distortion, Pinhole
 from iif_core.errors import InputError
 from workflow.intake import limits
 from workflow.intake.documents import read_json
-from workflow.intake.names import fault_of_name, same_name, shown
+from workflow.intake.names import existing, fault_of_name, forward, same_name, shown
 from workflow.settings.names import data_folder, did_you_mean_path
 from workflow.sources.folder_scene import images
 
@@ -37,6 +37,14 @@ KEYS = (
 """Keys of a transforms.json that are read; keys of other tools are ignored."""
 MISSPELT = 0.85
 """Similarity (difflib) from which an unknown key counts as a misspelt known one."""
+_HEIC = "Convert all of them: heif-convert <name>.HEIC <name>.jpg, or mogrify -format jpg *.HEIC (ImageMagick)"
+_RAW = "Develop all of them to linear EXR in sRGB primaries (darktable-cli <name>.DNG <name>.exr), or to JPEG"
+CONVERTERS = {
+    **dict.fromkeys((".heic", ".heif", ".avif"), _HEIC),
+    **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), _RAW),
+    **dict.fromkeys((".tif", ".tiff", ".webp", ".bmp"), "Convert all of them: mogrify -format png <files> (ImageMagick)"),
+}
+"""What to do with photographs of other formats."""
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 RIGID_TOLERANCE = 5e-3  # largest entry of R^T R - I: rounding to three decimals passes, a scale of 1 % does not
 MIN_OFFSET_IF_SWAPPED = 0.08
@@ -90,6 +98,8 @@ class Frame:
         exposure: factor on radiance before the response, where the source itself knows it.
         ids: map of object ids.
         truth: kind -> map of true materials, emission or radiance.
+        whole: the picture is the data window of an EXR, and not its display window.
+        colour: space of its colours, `file` = as the file says (`source.colour`).
     """
 
     name: str
@@ -109,6 +119,8 @@ class Frame:
     exposure: float | None = None
     ids: Path | None = None
     truth: dict[str, Path] = field(default_factory=dict)
+    whole: bool = False
+    colour: str = "file"
 
     def files(self) -> list[Path]:
         """List all files of the photograph."""
@@ -205,7 +217,9 @@ def read(source: dict[str, Any], capture: dict[str, Any]) -> Transforms:
     document = load(path)
     _refuse_misspelt(path, document)
     entries = _listed_splits(path, document, entries_of(path, document))
-    entries = [replace(e, mask=path.parent / str(e.keys["mask_path"])) if e.keys.get("mask_path") else e for e in entries]
+    entries = [
+        replace(e, mask=existing(path.parent / str(e.keys["mask_path"]))) if e.keys.get("mask_path") else e for e in entries
+    ]
     world = _applied(path, document) if source["applied_transform"] == "undo" else None
     return frames_of(path, document, entries, path.parent, source, capture, world)
 
@@ -235,7 +249,7 @@ def frames_of(
     Raises:
         InputError: at the first fault.
     """
-    raw = choose_entries(_matching(path, entries, source.get("frames")), capture["views"])
+    raw = choose_entries(_matching(path, _told_apart(entries), source.get("frames")), capture["views"])
     if all(entry.split == "test" for entry in raw):
         raise InputError(f"{path}: lists keep all {len(raw)} photographs for testing; at least one must be there to use")
     _unique_names(path, raw)
@@ -261,6 +275,7 @@ def frames_of(
     for frame in frames:
         if frame.mask is not None:
             images.header(frame.mask)  # refuses what is no picture, or cut short
+    frames = [replace(frame, colour=source.get("colour", "file")) for frame in frames]
     if world is not None:
         frames = [replace(f, matrix=_in_world(world, f.matrix)) for f in frames]
     return Transforms(path, tuple(frames), _depth_unit(path, document), source.get("axes", "opengl"))
@@ -309,7 +324,7 @@ def _listed_splits(path: Path, document: dict[str, Any], entries: list[Entry]) -
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
             raise InputError(f"{path}: `{key}` must be a list of file paths as in `frames`")
         for name in listed:
-            name = name.removeprefix("./")
+            name = forward(name).removeprefix("./")
             other = names.setdefault(name, key)
             if other != key and "train_filenames" in (other, key):
                 raise InputError(f"{path}: {name!r} is in `{other}` and in `{key}`: a test photograph must not be used")
@@ -369,13 +384,16 @@ def _frames(path: Path, document: dict[str, Any], key: str) -> list[Any]:
 def _entry(path: Path, index: int, entry: Any, key: str) -> Entry:
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str) or not entry["file_path"]:
         raise InputError(f"{path}: {key}[{index}]: needs a `file_path` (text) and a `transform_matrix`")
-    file_path = entry["file_path"].removeprefix("./")
+    file_path = forward(entry["file_path"]).removeprefix("./")
     if fault := fault_of_path(file_path):
         raise InputError(f"{path}: {key}[{index}]: `file_path` {shown(file_path)} {fault}")
+    keys = {name: entry[name] for name in entry if name != "file_path"}
     for other in ("mask_path", "depth_file_path"):
-        if entry.get(other) and (fault := fault_of_path(entry[other])):
-            raise InputError(f"{path}: {key}[{index}]: `{other}` {shown(entry[other])} {fault}")
-    return Entry(file_path, f"{key}[{index}] ({file_path})", {name: entry[name] for name in entry if name != "file_path"})
+        if isinstance(keys.get(other), str):
+            keys[other] = forward(keys[other])
+        if keys.get(other) and (fault := fault_of_path(keys[other])):
+            raise InputError(f"{path}: {key}[{index}]: `{other}` {shown(keys[other])} {fault}")
+    return Entry(file_path, f"{key}[{index}] ({file_path})", keys)
 
 
 def fault_of_path(stated: Any) -> str:
@@ -400,6 +418,20 @@ def _matching(path: Path, entries: list[Entry], pattern: str | None) -> list[Ent
         example = entries[0].file_path
         raise InputError(f"{path}: `source.frames: {pattern}` matches none of {len(entries)} frames (such as {example!r})")
     return kept
+
+
+def _told_apart(entries: list[Entry]) -> list[Entry]:
+    """Name all views by folder and file where files of one name lie in several folders, as in rigs: `left_0000`, `right_0000`."""
+    names = [same_name(entry.name) for entry in entries]
+    files = {os.path.normpath(entry.file_path) for entry in entries}
+    if len(set(names)) == len(names) or len(files) < len(entries) or any(entry.stated_name for entry in entries):
+        return entries
+    paths = [Path(entry.file_path).with_suffix("") for entry in entries]
+    shared = len(os.path.commonprefix([path.parent.parts for path in paths]))
+    longer = ["_".join(path.parts[shared:]) for path in paths]
+    if len({same_name(name) for name in longer}) < len(longer):
+        return entries
+    return [replace(entry, stated_name=name) for entry, name in zip(entries, longer, strict=True)]
 
 
 def _unique_names(path: Path, entries: list[Entry]) -> None:
@@ -434,17 +466,17 @@ def _one_photograph(first: str, second: str) -> bool:
 
 
 def _find_image(path: Path, root: Path, entry: Entry) -> Path:
-    stated = root / entry.file_path
+    stated = existing(root / entry.file_path)
     if stated.suffix.lower() in images.EXTENSIONS:
         return stated
-    candidates = [stated.with_name(stated.name + extension) for extension in images.EXTENSIONS]
-    found = [c for c in candidates if c.is_file()]
+    found = [c for c in (existing(stated.with_name(stated.name + e)) for e in images.EXTENSIONS) if c.is_file()]
     if len(found) > 1:
         names = " and ".join(c.name for c in found)
         raise InputError(f"{path}: {entry.file_path!r} has no extension and {names} exist; name the one you mean")
     if not found and stated.is_file():
         allowed = ", ".join(images.EXTENSIONS)
-        raise InputError(f"{stated}: not an image format that is read here; allowed: {allowed}. Convert it")
+        cure = CONVERTERS.get(stated.suffix.lower(), "Convert it")
+        raise InputError(f"{stated}: not an image format that is read here; allowed: {allowed}. {cure}")
     return found[0] if found else stated
 
 
@@ -543,12 +575,13 @@ def _frame(
     where = entry.where
     values = {key: value for key, value in document.items() if key != "frames"} | entry.keys
     width, height, turn = _size(path, where, values, image, header)
+    whole = (width, height) == header.data != header.size
     camera = _camera(path, where, values, width, height, offset, strict="w" not in values)
     if strict:
         _not_swapped(path, where, camera)
     depth, depth_camera, depth_matrix = None, None, None
     if entry.keys.get("depth_file_path"):
-        depth = path.parent / str(entry.keys["depth_file_path"])
+        depth = existing(path.parent / str(entry.keys["depth_file_path"]))
         if isinstance(values.get("depth_intrinsics"), dict):
             own = values["depth_intrinsics"]
             size = images.header(depth).size if depth.is_file() else (width, height)
@@ -570,6 +603,7 @@ def _frame(
         entry.mask_full,
         entry.split,
         entry.seen,
+        whole=whole,
     )
 
 
@@ -589,6 +623,8 @@ def _size(path: Path, where: str, values: dict[str, Any], image: Path, header: i
                 " cameras belong to the turned picture; save the images upright (orientation 1) and repeat the pose"
                 " estimation, or remove the EXIF tag if the poses were made from the stored pixels"
             )
+    if stated == header.data:  # of an EXR with overscan, or a crop, whose cameras belong to all its pixels
+        return *stated, 1
     if stated != stored:
         factor = stored[0] / stated[0] if stated[0] else 0
         same_shape = factor > 0 and abs(stored[1] - stated[1] * factor) <= 1

@@ -1,0 +1,361 @@
+"""Photographs as other programs write them: windows of EXR, colours by chunks and EXIF, black borders, names of other systems."""
+
+import json
+import struct
+import unicodedata
+import zlib
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from iif_core.numerics.color import linear_from_srgb, srgb_from_linear
+from tests.errors import refused
+from tests.unit import own_scene as own
+from workflow.intake.names import existing
+from workflow.sources.folder_scene import borders, images, transforms
+from workflow.sources.folder_scene.profiles import SPACES
+
+# -------------------------------------------------------------------------------------------------------- windows of EXR
+
+
+def exr(path, picture, place=(0, 0), display=None):
+    """An EXR whose first pixel is at `place` (x, y) of a display window of the given size (width, height)."""
+    height, width = picture.shape[:2]
+    size = display or (width, height)
+    corner = (place[0] + width - 1, place[1] + height - 1)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header |= {"dataWindow": (place, corner), "displayWindow": ((0, 0), (size[0] - 1, size[1] - 1))}
+    header = {k: tuple(np.array(c, np.int32) for c in v) if "Window" in k else v for k, v in header.items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    channels = {c: np.ascontiguousarray(picture[..., k], np.float32) for k, c in enumerate("RGB")}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))
+    return path
+
+
+def picture(width, height):
+    return np.random.default_rng(1).uniform(0.1, 1.0, (height, width, 3)).astype(np.float32)
+
+
+def test_a_crop_stands_where_it_was(tmp_path):
+    whole = picture(20, 12)
+    path = exr(tmp_path / "a.exr", whole[3:9, 5:18], (5, 3), (20, 12))
+    photo = images.load_photo(path)
+    assert images.header(path).size == (20, 12) and photo.pixels.shape == (12, 20, 3)
+    np.testing.assert_array_equal(photo.pixels[3:9, 5:18], whole[3:9, 5:18])
+    held = np.zeros((12, 20), bool)
+    held[3:9, 5:18] = True
+    np.testing.assert_array_equal(photo.valid, held)
+    assert (photo.outside, photo.non_finite) == (240 - 78, 0)
+
+
+def test_overscan_is_cut_off(tmp_path):
+    whole = picture(20, 12)
+    path = exr(tmp_path / "a.exr", whole, (-4, -2), (12, 8))
+    photo = images.load_photo(path)
+    np.testing.assert_array_equal(photo.pixels, whole[2:10, 4:16])
+    assert photo.valid.all() and photo.outside == 0
+    np.testing.assert_array_equal(images.load_photo(path, whole=True).pixels, whole)
+
+
+def test_a_window_beside_the_picture_holds_nothing_of_it(tmp_path):
+    photo = images.load_photo(exr(tmp_path / "a.exr", picture(6, 4), (100, 100), (10, 8)))
+    assert photo.pixels.shape == (8, 10, 3) and not photo.valid.any()
+
+
+@pytest.mark.parametrize("stated, shape", [((12, 8), (12, 8)), ((20, 12), (20, 12)), (None, (12, 8))])
+def test_cameras_belong_to_the_window_of_their_size(tmp_path, stated, shape):
+    path = own.project(tmp_path, capture={"dynamic_range": "hdr"})
+    document = own.bare(path)
+    for i, entry in enumerate(document["frames"]):
+        entry["file_path"] = f"images/{i}.exr"
+        exr(path / entry["file_path"], picture(20, 12), (-4, -2), (12, 8))
+    for key in ("w", "h", "cx", "cy", "fl_x", "fl_y"):
+        document.pop(key, None)
+    document |= {"fl_x": 15.0} | ({"w": stated[0], "h": stated[1]} if stated else {})
+    own.write_transforms(path, document)
+    source = {"path": str(path), "cameras": None, "applied_transform": "keep", "alignment": "off"}
+    frames = transforms.read(source, {"views": 9, "dynamic_range": "hdr"}).frames
+    assert {(f.camera.width, f.camera.height, f.camera.fx) for f in frames} == {(*shape, 15.0)}
+    assert images.load_photo(frames[0].image, 1, frames[0].whole).pixels.shape[:2] == shape[::-1]
+
+
+def test_crops_of_different_sizes_share_intrinsics(tmp_path):
+    path = own.project(tmp_path, capture={"dynamic_range": "hdr"})
+    document, shots = own.photographed(path, 4, depth=False, hdr=True)
+    for i, (_, shot, _, _) in enumerate(shots):
+        exr(path / f"images/{i:03d}.exr", shot[2 * i :, 3 * i :], (3 * i, 2 * i), (64, 48))
+    for key in ("w", "h"):
+        document.pop(key)
+    own.write_transforms(path, document)
+    capture = own.run(tmp_path, "capture")
+    for i, view in enumerate(capture):
+        photo, valid = capture.photo(view)
+        assert valid[2 * i :, 3 * i :].all() and not valid[: 2 * i].any() and not valid[:, : 3 * i].any()
+        np.testing.assert_allclose(photo[valid], shots[i][1][valid], atol=2e-5)
+
+
+# --------------------------------------------------------------------------------------------------- colours of PNG, JPEG
+
+
+def png(path, values, chunks, bits=16):
+    """A PNG of colours (h, w, 3) in [0, 1] with chunks before its pixels."""
+    rows = np.rint(values * (2**bits - 1)).astype(">u2" if bits == 16 else np.uint8)
+
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    raw = b"".join(b"\0" + row.tobytes() for row in rows)
+    head = struct.pack(">IIBBBBB", rows.shape[1], rows.shape[0], bits, 2, 0, 0, 0)
+    parts = [
+        chunk(b"IHDR", head),
+        *(chunk(*own_chunk) for own_chunk in chunks),
+        chunk(b"IDAT", zlib.compress(raw)),
+        chunk(b"IEND", b""),
+    ]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+    return path
+
+
+def gama(gamma):
+    return b"gAMA", struct.pack(">I", round(gamma * 100_000))
+
+
+def chrm(name):
+    red, green, blue, white = SPACES[name].primaries
+    return b"cHRM", struct.pack(">8I", *(round(v * 100_000) for point in (white, red, green, blue) for v in point))
+
+
+LIGHT = np.stack(np.meshgrid(*[np.linspace(0.05, 0.6, 4)] * 3, indexing="ij"), -1).reshape(8, 8, 3)
+"""Linear Rec. 709, inside every other space."""
+
+
+def in_space(name, light=LIGHT):
+    matrix = SPACES[name].matrix
+    return light if matrix is None else light @ np.linalg.inv(matrix).T
+
+
+def agrees(photo, light=LIGHT, atol=0.001):
+    np.testing.assert_allclose(linear_from_srgb(photo.pixels), light, atol=atol)
+
+
+@pytest.mark.parametrize("bits, atol", [(16, 2e-4), (8, 0.01)])
+def test_a_linear_png_that_says_so(tmp_path, bits, atol):
+    photo = images.load_photo(png(tmp_path / "a.png", LIGHT, [gama(1.0)], bits))
+    agrees(photo, atol=atol)
+    assert "gamma 1" in photo.form
+
+
+def test_gamma_and_primaries_of_png(tmp_path):
+    agrees(images.load_photo(png(tmp_path / "a.png", LIGHT ** (1 / 1.8), [gama(1 / 1.8)])), atol=2e-4)
+    p3 = srgb_from_linear(in_space("display_p3"))
+    agrees(images.load_photo(png(tmp_path / "b.png", p3, [gama(0.45455), chrm("display_p3")])), atol=2e-4)
+    wide = np.clip(in_space("rec2020"), 0, 1)
+    agrees(images.load_photo(png(tmp_path / "c.png", wide, [gama(1.0), chrm("rec2020")])), atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    "chunks", [[], [(b"sRGB", b"\0")], [gama(0.45455)], [(b"sRGB", b"\0"), gama(1.0)], [(b"cICP", bytes([1, 13, 0, 1]))]]
+)
+def test_what_is_srgb_stays_as_it_is(tmp_path, chunks):
+    photo = images.load_photo(png(tmp_path / "a.png", srgb_from_linear(LIGHT), chunks))
+    agrees(photo, atol=2e-4)
+    assert photo.form == "16-bit"
+
+
+def test_code_points_of_png_come_first(tmp_path):
+    linear = png(tmp_path / "a.png", LIGHT, [(b"cICP", bytes([1, 8, 0, 1])), gama(0.45455), (b"sRGB", b"\0")])
+    agrees(images.load_photo(linear), atol=2e-4)
+    p3 = srgb_from_linear(in_space("display_p3"))
+    agrees(images.load_photo(png(tmp_path / "b.png", p3, [(b"cICP", bytes([12, 13, 0, 1]))])), atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    "coded, said", [((9, 16, 0, 1), "PQ"), ((9, 18, 0, 1), "HLG"), ((77, 13, 0, 1), "77"), ((1, 13, 0, 0), "range")]
+)
+def test_curves_for_screens_are_refused_by_name(tmp_path, coded, said):
+    with refused("a.png", said):
+        images.load_photo(png(tmp_path / "a.png", LIGHT, [(b"cICP", bytes(coded))]))
+
+
+def test_primaries_that_span_nothing_are_refused(tmp_path):
+    same = b"cHRM", struct.pack(">8I", *[30000] * 8)
+    with refused("a.png", "cHRM"):
+        images.load_photo(png(tmp_path / "a.png", LIGHT, [same]))
+
+
+def test_adobe_rgb_by_exif_alone(tmp_path):
+    values = in_space("adobe_rgb") ** (256 / 563)
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA001] = 65535
+    exif.get_ifd(0x8769)[0xA005] = {1: "R03"}
+    stored = Image.fromarray(np.rint(values * 255).astype(np.uint8))
+    stored.save(tmp_path / "a.jpg", quality=100, subsampling=0, exif=exif)
+    photo = images.load_photo(tmp_path / "a.jpg")
+    agrees(photo, atol=0.03)
+    assert "Adobe RGB" in photo.form
+    plain = Image.Exif()
+    plain.get_ifd(0x8769)[0xA005] = {1: "R98"}
+    stored.save(tmp_path / "b.jpg", quality=100, subsampling=0, exif=plain)
+    assert images.load_photo(tmp_path / "b.jpg").form == ""
+
+
+@pytest.mark.parametrize("name", sorted(SPACES))
+def test_the_setting_overrides_what_a_file_says(tmp_path, name):
+    space = SPACES[name]
+    light = np.clip(in_space(name), 0, 1)
+    encoded = {
+        "srgb": srgb_from_linear,
+        "display_p3": srgb_from_linear,
+        "adobe_rgb": lambda x: x ** (256 / 563),
+        "rec2020": lambda x: np.where(x < 0.018, 4.5 * x, 1.099 * x**0.45 - 0.099),
+    }.get(name, lambda x: x)
+    path = png(tmp_path / "a.png", encoded(light), [gama(1 / 3), chrm("rec2020")])
+    agrees(images.load_photo(path, colour=name), atol=5e-4)
+    exr(tmp_path / "a.exr", light)
+    np.testing.assert_allclose(images.load_photo(tmp_path / "a.exr", colour=name).pixels, LIGHT, atol=0.01)
+    assert space.name
+
+
+# -------------------------------------------------------------------------------------------------------- black borders
+
+
+def bordered(root, hidden, count=6, suffix=".png", quality=95):
+    """Photographs of the room with `hidden` (48, 64) bool in black."""
+    path = own.project(root, source={"alignment": "warn"})
+    document, shots = own.photographed(path, count, depth=False)
+    for i, entry in enumerate(document["frames"]):
+        shot = np.where(hidden(i)[..., None], 0.0, shots[i][1])
+        (path / entry["file_path"]).unlink()
+        entry["file_path"] = entry["file_path"].replace(".png", suffix)
+        pixels = Image.fromarray(np.rint(shot * 255).astype(np.uint8))
+        pixels.save(path / entry["file_path"], **({"quality": quality} if suffix == ".jpg" else {}))
+    own.write_transforms(path, document)
+    return own.run(root, "capture")
+
+
+def curved(_):
+    """Cushion-shaped, as an undistorted photograph is."""
+    v, u = np.mgrid[-1:1:48j, -1:1:64j]
+    r2 = u * u + v * v
+    return (np.abs(u) * (1 + 0.15 * r2) > 1.0) | (np.abs(v) * (1 + 0.15 * r2) > 1.0)
+
+
+def letterbox(_):
+    out = np.zeros((48, 64), bool)
+    out[:6], out[-6:] = True, True
+    return out
+
+
+@pytest.mark.parametrize(
+    "hidden, suffix, rim",
+    [(curved, ".png", borders.RIM), (letterbox, ".png", borders.RIM), (letterbox, ".jpg", borders.JPEG_RIM)],
+)
+def test_a_border_is_left_out_and_told(tmp_path, hidden, suffix, rim):
+    from scipy.ndimage import binary_dilation
+
+    capture = bordered(tmp_path, hidden, suffix=suffix)
+    for view in capture:
+        left_out = ~capture.photo(view)[1]
+        assert left_out[hidden(0)].all() and not left_out[~binary_dilation(hidden(0), iterations=rim)].any()
+    assert any("border" in note for note in capture.facts["notes"])
+
+
+def in_the_middle(_):
+    out = np.zeros((48, 64), bool)
+    out[20:30, 20:30] = True
+    return out
+
+
+def of_some(i):
+    return letterbox(i) if i % 2 else np.zeros((48, 64), bool)
+
+
+def dark_corner(i):
+    """Dark surface at the edge, which moves with the camera."""
+    out = np.zeros((48, 64), bool)
+    out[:10, 10 * i : 10 * i + 12] = True
+    return out
+
+
+@pytest.mark.parametrize("hidden", [in_the_middle, of_some, dark_corner])
+def test_dark_surface_is_no_border(tmp_path, hidden):
+    capture = bordered(tmp_path, hidden)
+    assert all(capture.photo(view)[1].all() for view in capture)
+    assert not any("border" in note for note in capture.facts["notes"])
+
+
+def test_a_dark_frame_that_is_not_black_is_surface():
+    pixels = np.full((20, 30, 3), 0.5)
+    pixels[:4] = 6 / 255
+    assert not borders.black_border(pixels, np.ones((20, 30), bool), True).any()
+    pixels[:4] = 1 / 255
+    assert borders.black_border(pixels, np.ones((20, 30), bool), True)[:4].all()
+
+
+# ---------------------------------------------------------------------------------------------- names from other systems
+
+
+def renamed(tmp_path, on_disk, in_list, masks=False):
+    path = own.project(tmp_path)
+    document = own.bare(path)
+    for i, entry in enumerate(document["frames"]):
+        place = path / on_disk.format(i)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        (path / entry["file_path"]).rename(place)
+        entry["file_path"] = in_list.format(i)
+        if masks:
+            own.save_png(path / "masks" / f"{i}.PNG", np.ones((48, 64)))
+            entry["mask_path"] = f"masks\\{i}.png"
+    if not any((path / "images").iterdir()):
+        (path / "images").rmdir()
+    (path / "transforms.json").write_text(json.dumps(document, ensure_ascii=False), encoding="utf-8")
+    source = {"path": str(path), "cameras": None, "applied_transform": "keep", "alignment": "off"}
+    return transforms.read(source, {"views": 9, "dynamic_range": "ldr"}).frames
+
+
+COMPOSED = unicodedata.normalize("NFC", "Küche é {}.png")
+
+
+@pytest.mark.parametrize(
+    "on_disk, in_list",
+    [
+        ("images/f_{}.png", ".\\images\\f_{}.png"),
+        ("images/a b/f {}.png", "images\\a b\\f {}.png"),
+        ("images/F_{}.PNG", "images/f_{}.png"),
+        ("images/F_{}.PNG", "images/F_{}"),
+        ("Images/f_{}.png", "images/f_{}"),
+        (unicodedata.normalize("NFD", COMPOSED), COMPOSED),
+        (COMPOSED, unicodedata.normalize("NFD", COMPOSED)),
+    ],
+)
+def test_files_are_found_under_the_names_of_other_systems(tmp_path, on_disk, in_list):
+    frames = renamed(tmp_path, on_disk, in_list, masks=True)
+    assert [f.image.is_file() and f.mask.is_file() for f in frames] == [True] * 3
+    assert len({f.image for f in frames}) == 3
+
+
+def test_two_files_of_nearly_one_name_are_not_confused(tmp_path):
+    (tmp_path / "a.PNG").touch()
+    assert existing(tmp_path / "a.png") == tmp_path / "a.PNG"
+    (tmp_path / "A.png").touch()
+    assert existing(tmp_path / "a.png") == tmp_path / "a.png"  # either could be meant
+    assert existing(tmp_path / "A.png") == tmp_path / "A.png"
+
+
+def test_cameras_of_a_rig_share_names(tmp_path):
+    path = own.project(tmp_path)
+    document = own.bare(path, 4)
+    for i, entry in enumerate(document["frames"]):
+        name = f"images/{('left', 'right')[i % 2]}/cam/{i // 2:04d}.png"
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        (path / entry["file_path"]).rename(path / name)
+        entry["file_path"] = name
+    own.write_transforms(path, document)
+    source = {"path": str(path), "cameras": None, "applied_transform": "keep", "alignment": "off"}
+    frames = transforms.read(source, {"views": 9, "dynamic_range": "ldr"}).frames
+    assert [f.name for f in frames] == ["left_cam_0000", "right_cam_0000", "left_cam_0001", "right_cam_0001"]
+    fewer = transforms.read(source, {"views": 2, "dynamic_range": "ldr"}).frames
+    assert {f.name for f in fewer} <= {f.name for f in frames}  # names do not depend on how many are taken
