@@ -53,6 +53,7 @@ include: "workflow/rules/unknown.smk"
 onstart:
     choose.keep(REQUEST, CHOSEN)
     tell_costs()
+    keep_own_files()
 
 
 onsuccess:
@@ -60,4 +61,5 @@ onsuccess:
 
 
 onerror:
+    put_back_own_files()
     tell_reasons()

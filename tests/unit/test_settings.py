@@ -272,6 +272,9 @@ def test_limits_of_a_scene_hold_for_every_quality_and_raise_nothing(repository, 
     assert draft.capture.views <= 20 and draft.capture.width <= 200 and draft.prior.samples <= 6
     (tmp_path / "config/scenes/t.yaml").write_text(text + "capture: {views: 30}\n")  # what the scene sets itself, holds
     assert settings.load("t", "paper", tmp_path).capture.views == 30
+    (tmp_path / "config/scenes/t.yaml").write_text(text.replace("width: 200", "width: 320, height: 240"))
+    wide = settings.load("t", "paper", tmp_path).capture  # a photograph of 320 x 240 stays as it is
+    assert (wide.width, wide.height) == (320, 240)
     (tmp_path / "config/scenes/t.yaml").write_text(text.replace("views: 20", "views: 0"))
     with refused("config/scenes/t.yaml", "limits.views", 0, 1):
         settings.load("t", "draft", tmp_path)

@@ -1,11 +1,14 @@
 """The deliverable of the tiny scene: the files and columns that users rely on."""
 
 import json
+import shutil
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import yaml
+
+from workflow.artifacts import kept
 
 FILES = """scene.glb mitsuba/scene.xml mitsuba/render.py objects.parquet objects.csv emitters.parquet plan.yaml verdict.json
 metrics.parquet timings.parquet report.html room.html scene_unlit.glb scene.usdc manifest.json""".split()
@@ -65,3 +68,50 @@ def test_the_last_line_says_where_to_look(workflow):
     assert result.returncode == 0, result.stderr[-4000:]
     pages = [workflow.folder.resolve() / f"scenes/tiny/{name}.html" for name in ("report", "room")]
     assert result.stderr.rstrip().endswith(f"Open: {pages[0]}\n      {pages[1]}")
+
+
+OWN = {"room.blend": b"a scene of Blender", "renders/night.png": b"a picture", "maps/notes.txt": b"beside files of the workflow"}
+
+
+def put(folder, names=OWN):
+    for name, data in names.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+    (folder / "latest").symlink_to("renders")
+
+
+def has_own(folder):
+    return all((folder / name).read_bytes() == data for name, data in OWN.items()) and (folder / "latest").is_symlink()
+
+
+def test_files_of_the_user_outlive_a_new_deliverable(workflow):
+    scene = workflow.folder / "scenes/tiny"
+    put(scene)
+    before = json.loads((scene / "manifest.json").read_text())["files"]
+    result = workflow.run("scenes/tiny", "--forcerun", "publish")
+    assert result.returncode == 0, result.stderr[-4000:]
+    assert has_own(scene) and not list(scene.parent.glob(".*"))
+    assert json.loads((scene / "manifest.json").read_text())["files"].keys() == before.keys()
+    assert workflow.run("scenes/tiny").returncode == 0  # they are no damage
+    assert has_own(scene)
+
+
+def test_files_of_the_user_outlive_a_run_that_was_killed(workflow):
+    scene = workflow.folder / "scenes/tiny"
+    put(scene)
+    kept.set_apart(scene)
+    shutil.rmtree(scene)  # as Snakemake does before the job that publishes, which then is killed
+    result = workflow.run("scenes/tiny")
+    assert result.returncode == 0, result.stderr[-4000:]
+    assert has_own(scene) and (scene / "report.html").is_file()
+
+
+def test_files_of_the_user_outlive_a_job_that_fails(workflow):
+    scene = workflow.folder / "scenes/tiny"
+    put(scene)
+    record = workflow.folder / "results/tiny/publish"
+    shutil.rmtree(record)
+    record.write_text("a file where the stage writes its folder")
+    result = workflow.run("scenes/tiny", "--forcerun", "publish")
+    assert result.returncode != 0
+    assert has_own(scene)

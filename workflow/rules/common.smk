@@ -13,7 +13,7 @@ sys.path.insert(0, CHECKOUT)
 from snakemake.cli import get_argument_parser
 
 from iif_core.errors import InputError
-from workflow.artifacts import links, sound
+from workflow.artifacts import kept, links, sound
 from workflow.batch import causes
 from workflow.batch import plan as batch_table
 from workflow.comparison import named as comparison
@@ -237,6 +237,8 @@ def publish_inputs(wildcards):
     """What is published. A deliverable is published again if one of its files is missing, or if it is not the one that is wanted."""
     scene, folder = wildcards.scene, f"scenes/{wildcards.scene}"
     folder_or_stop(folder)
+    if workflow.is_main_process:
+        or_stop(choose.refuse_cheaper, scene, quality_of(scene), config)
     mark = or_stop(fingerprints.fingerprint, "publish", scene, quality_of(scene))
     faults = or_stop(sound.deliverable_faults, Path(folder), Path("results"), scene, mark)
     again_if_unsound(folder, f"{folder} is published again", faults)

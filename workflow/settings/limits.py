@@ -14,8 +14,8 @@ class Limits(Section):
     views: int | None = Field(None, ge=1)
     """Photographs (`capture.views`)."""
     width: int | None = Field(None, ge=16)
-    """Pixels (`capture.width`); width and height are reduced together."""
+    """Pixels (`capture.width`); without a limit of the height, both are reduced together."""
     height: int | None = Field(None, ge=16)
-    """Pixels (`capture.height`)."""
+    """Pixels (`capture.height`); without a limit of the width, both are reduced together."""
     predictions: int | None = Field(None, ge=1)
     """Predictions of each photograph (`prior.samples`)."""

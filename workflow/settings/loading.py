@@ -182,7 +182,8 @@ def _quality(quality: str, root: Path) -> dict[str, Any]:
 
 
 def limited(settings: dict[str, Any], limits: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of a quality with no more than a scene allows; width and height keep their ratio.
+    """Return the settings of a quality with no more than a scene allows; where only one of width and height is limited, they keep
+    their ratio.
 
     Args:
         settings: of a quality.
@@ -195,8 +196,9 @@ def limited(settings: dict[str, Any], limits: dict[str, Any]) -> dict[str, Any]:
     }
     out = dict(settings)
     if all(isinstance(capture[name], int) for name in ("views", "width", "height")):
-        share = min(1.0, *(most.get(name, capture[name]) / capture[name] for name in ("width", "height")))
-        sizes = {name: max(round(share * capture[name]), 16) for name in ("width", "height")}
+        shares = {name: min(1.0, most[name] / capture[name]) for name in ("width", "height") if name in most}
+        both = shares if len(shares) == 2 else dict.fromkeys(("width", "height"), min(shares.values(), default=1.0))
+        sizes = {name: max(round(share * capture[name]), 16) for name, share in both.items()}
         out["capture"] = {**capture, **sizes, "views": min(capture["views"], most.get("views", capture["views"]))}
     prior = settings.get("prior", {})
     if isinstance(prior, dict) and isinstance(prior.get("samples"), int):

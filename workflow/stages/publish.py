@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
+from workflow.artifacts import kept, stamps
 from workflow.artifacts import manifest as manifests
-from workflow.artifacts import stamps
 from workflow.artifacts.files import copy, flush_folders, inside, make_folder, named, sha256_of, write_parquet
 from workflow.artifacts.manifest import MANIFEST, SCENE_SCHEMA
 from workflow.artifacts.store import StageReader
@@ -35,6 +35,8 @@ def run(job: Job) -> None:
     writer = job.writer  # from here on, the stage is not finished
     facts = {"scene": job.scene, "quality": job.quality, "fingerprint": job.fingerprint, "settings": job.document}
     published, size = deliver(readers, facts, read_timings(job.scene))
+    if own := kept.put_back(Path("scenes") / job.scene):
+        job.log.info("scenes/%s: kept %d files that were put there: %s", job.scene, len(own), ", ".join(own[:5]))
     writer.json("published.json", published)
     job.log.info("scenes/%s: %d files, %.1f MB", job.scene, len(published["files"]), size / 1e6)
 
@@ -57,6 +59,8 @@ def deliver(readers: dict[str, StageReader], facts: dict[str, Any], timings: lis
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         files, seen = _build(readers, facts, timings, temporary)
+        if target.is_dir():  # run by hand; otherwise Snakemake has removed it
+            kept.set_apart(target)
         replace(temporary, target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

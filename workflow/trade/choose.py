@@ -20,8 +20,11 @@ from workflow.settings.names import DEFAULT, did_you_mean, quality_names
 from workflow.trade import bench
 from workflow.trade.points import SCORES, SHIPPED, Point, measured_scores, point_of, points
 
-KEYS = ("quality", "maps", "colour")
-"""Keys of `--config`; `inputs` says how inputs are compared, the last two what `score/<scene>` reads."""
+KEYS = ("quality", "replace", "maps", "colour")
+"""Keys of `--config`; `replace` lets a cheaper result take the place of a finished one, the last two are what `score/<scene>`
+reads."""
+YES, NO = ("yes", "true"), ("no", "false")
+"""Values of `replace`; YAML makes truth values of the words."""
 RENAMED = {
     "point": "write --config quality={}",
     "budget": "write --config quality={}s",
@@ -81,6 +84,8 @@ def read(config: Mapping[str, Any], cores: int | None) -> Request:
             f"--config {key}: unknown key.{did_you_mean(key, KEYS)} Allowed: {', '.join(KEYS)}."
             " Everything else belongs in config/scenes/<scene>.yaml (docs/reference/settings.md)."
         )
+    if str(config.get("replace", "no")).lower() not in (*YES, *NO):
+        raise InputError(f"--config replace={config['replace']}: allowed are yes and no")
     value, known = str(config.get("quality", DEFAULT)), quality_names()
     if value in known:
         return Request(value, value, cores or 1)
@@ -93,6 +98,37 @@ def read(config: Mapping[str, Any], cores: int | None) -> Request:
         f"--config quality={value}: unknown quality.{did_you_mean(value, known)} Allowed: {', '.join(known)}; seconds of wall"
         f" time, such as 120s; a score in dB, such as {' or '.join(f'{name}:24' for name in SCORES)}"
     )
+
+
+def refuse_cheaper(scene: str, quality: str, config: Mapping[str, Any]) -> None:
+    """Refuse a run whose result would silently take the place of a finished one that was made from more pixels.
+
+    Raises:
+        InputError: `scenes/<scene>` has another quality, with more photographs, pixels or predictions, and `--config replace=yes`
+            was not given.
+    """
+    made = facts_in(Path("scenes") / scene / "manifest.json")
+    before, work = str(made.get("quality", "")), _work(made.get("settings"))
+    if not work or before not in quality_names() or canonical(before) == canonical(quality) or _is_yes(config.get("replace")):
+        return
+    if _work(json.loads(fingerprints.resolved(scene, quality))) < work:
+        raise InputError(
+            f"scenes/{scene}: holds a result of quality {before}, which the cheaper quality {quality} would replace."
+            f" Add --config quality={before} to keep it up to date, or --config quality={quality} replace=yes"
+        )
+
+
+def _work(settings: Any) -> int:
+    """Return how many pixels are predicted under the settings of a scene, in the unit of one prediction; 0 = not known."""
+    try:
+        capture = settings["capture"]
+        return int(capture["views"] * capture["width"] * capture["height"] * settings["prior"].get("samples", 1))
+    except (AttributeError, KeyError, TypeError):
+        return 0
+
+
+def _is_yes(value: Any) -> bool:
+    return str(value).lower() in YES
 
 
 def choice(request: Request, scene: str) -> Choice:
