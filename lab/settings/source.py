@@ -38,6 +38,8 @@ class MitsubaSource(Section):
     kind: Literal["mitsuba"]
     path: Path
     """XML file of the scene."""
+    unit: Literal["m", "cm", "mm", "km", "ft", "in"] | float = "m"
+    """Unit of the scene; a number is metres per unit."""
     max_bounces: int = Field(16, ge=1, le=64)
     """Longest path of the rendered photographs, in bounces."""
     drop_transparent: bool = True

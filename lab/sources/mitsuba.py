@@ -22,6 +22,8 @@ from lab.sources.rendered import RenderedWriter
 from workflow.intake.meshes import check_mesh
 from workflow.intake.pictures import check_texture
 from workflow.scene.normal_form import Truth, View
+from workflow.sources.folder_scene.mesh import check_across
+from workflow.sources.folder_scene.transforms import metres_per_unit
 
 if TYPE_CHECKING:
     from lab.simulated.scanned import Scanned
@@ -78,7 +80,10 @@ class _Capture:
         xml = Path(self.source.path)
         trial.check(xml, mi.variant())
         self.loaded = scene.load(xml)
+        self.metres = metres_per_unit(self.source.unit)
         everything = flatten.flatten(self.loaded)
+        everything = replace(everything, vertices=everything.vertices * self.metres)
+        check_across(xml, everything.vertices, self.source.unit, self.metres)
         self.table = materials.MaterialTable(everything.shapes)
         self.notes = [*self.loaded.notes, *everything.notes, *self.table.notes(everything)]
         self._environment()
@@ -188,7 +193,7 @@ class _Capture:
                 self.notes.append(f"sensor {sensor.class_name()}: no pinhole, not used")
                 continue
             matrix = np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4)
-            origin, forward, upward = matrix[:3, 3], matrix[:3, 2], matrix[:3, 1]
+            origin, forward, upward = matrix[:3, 3] * self.metres, matrix[:3, 2], matrix[:3, 1]
             if np.linalg.det(matrix[:3, :3]) < 0:
                 self.notes.append("a sensor's to_world mirrors the picture: the view is taken unmirrored")
             tangent = float(np.tan(np.radians(np.array(parameters["x_fov"]).ravel()[0]) / 2))
@@ -226,7 +231,10 @@ class _Capture:
 
         depth, face, truth = over_pixels(view, self._look, self.mesh.shape)
         samples = self.renderings.samples
-        image, valid, dropped = render.render_view(self.loaded.scene, integrator, view, samples, self.job.seed)
+        pose = view.world_from_camera.copy()
+        pose[:3, 3] /= self.metres
+        in_scene = replace(view, world_from_camera=pose)
+        image, valid, dropped = render.render_view(self.loaded.scene, integrator, in_scene, samples, self.job.seed)
         image = self.renderings.denoised(image, truth.albedo, self._normals(view, face))
         facts = {"dropped": dropped, "invalid": np.flatnonzero(~valid).tolist()}
         self.writer.rendered(view.name, depth, face, replace(truth, radiance=image), facts)
@@ -247,7 +255,7 @@ class _Capture:
         point = origin + t[hit, None].astype(np.float64) * rays[hit]
         surface = self.table.evaluate(self.mesh, on, materials.barycentric_of(self.mesh, on, point))
         front = (self.geometry.normals[on] * rays[hit]).sum(1) < 0
-        original = render.original_distance(self.loaded.scene, origin, rays[hit])
+        original = render.original_distance(self.loaded.scene, origin / self.metres, rays[hit]) * self.metres
         tessellated = np.array([shape.plugin in TESSELLATED for shape in self.mesh.shapes])
         slack = np.where(tessellated[self.mesh.shape[on]], ROUND_DEPTH_TOLERANCE, DEPTH_TOLERANCE)
         undisturbed = np.abs(original - t[hit]) <= slack * t[hit]

@@ -306,22 +306,8 @@ def check_size(path: Path, mesh: Mesh, unit: str | float, metres: float, centres
     Raises:
         InputError: the size is implausible, or most cameras are far from the mesh.
     """
-    low, high = DIAGONAL
+    check_across(path, mesh.vertices, unit, metres, centres)
     diagonal = mesh.diagonal
-    if not low <= diagonal <= high:
-        found = f"{path}: the scene is {diagonal:.4g} m across (allowed {low:g} to {high:g} m), read with"
-        found += f" `source.unit: {unit}`"
-        cameras = float(np.linalg.norm(np.ptp(centres, axis=0)))
-        if diagonal > high and 0.1 < cameras < 1e-2 * diagonal:
-            raise InputError(
-                f"{found}, but the cameras span {cameras:.3g} m: mesh and poses are in different units; bring the mesh"
-                " into the unit of transforms.json (is it in millimetres? then scale its vertices by 0.001)"
-            )
-        across = {name: diagonal / metres * factor for name, factor in METRES.items()}
-        name, size = min(across.items(), key=lambda item: abs(np.log(item[1] / TYPICAL_DIAGONAL)))
-        if low <= size <= high:
-            raise InputError(f"{found}; `source: {{unit: {name}}}` makes it {size:.3g} m")
-        raise InputError(f"{found}; give its unit as a number: `source: {{unit: <metres per unit>}}`")
     bounds = mesh.bounds
     outside = np.linalg.norm(np.maximum(np.maximum(bounds[0] - centres, centres - bounds[1]), 0), axis=1)
     far = outside > diagonal
@@ -331,6 +317,30 @@ def check_size(path: Path, mesh: Mesh, unit: str | float, metres: float, centres
             f" from the mesh (median {np.median(outside):.3g} m); {_factor_advice(bounds, centres)}"
             " export both from the same tool (docs/guide/own-data.md, mesh and poses in one frame)"
         )
+
+
+def check_across(path: Path, vertices: np.ndarray, unit: str | float, metres: float, centres: np.ndarray | None = None) -> None:
+    """Refuse a scene whose size (m) cannot be that of a room; the message proposes the unit that would make it one.
+
+    Raises:
+        InputError: its vertices (n, 3), in metres, reach less than 0.5 m or more than 200 m; other arguments as `check_size`.
+    """
+    low, high = DIAGONAL
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    if low <= diagonal <= high:
+        return
+    found = f"{path}: the scene is {diagonal:.4g} m across (allowed {low:g} to {high:g} m), read with `source.unit: {unit}`"
+    cameras = 0.0 if centres is None else float(np.linalg.norm(np.ptp(centres, axis=0)))
+    if diagonal > high and 0.1 < cameras < 1e-2 * diagonal:
+        raise InputError(
+            f"{found}, but the cameras span {cameras:.3g} m: mesh and poses are in different units; bring the mesh"
+            " into the unit of transforms.json (is it in millimetres? then scale its vertices by 0.001)"
+        )
+    across = {name: diagonal / metres * factor for name, factor in METRES.items()}
+    name, size = min(across.items(), key=lambda item: abs(np.log(item[1] / TYPICAL_DIAGONAL)))
+    if low <= size <= high:
+        raise InputError(f"{found}; `source: {{unit: {name}}}` makes it {size:.3g} m")
+    raise InputError(f"{found}; give its unit as a number: `source: {{unit: <metres per unit>}}`")
 
 
 def _factor_advice(bounds: np.ndarray, centres: np.ndarray) -> str:
