@@ -210,7 +210,7 @@ def test_images_without_pose_masks_and_places(room, views, tmp_path):
     assert any("1 of 5 images have no pose" in note and "DSC00099" in note for note in found.notes)
     assert [f.mask.name if f.mask else None for f in found.frames] == [None, "DSC00001.JPG.png", "DSC00002.JPG.png", None]
     (path / "sparse/0").rename(path / "elsewhere")
-    named(refused(path), path, "transforms.json", "COLMAP", "docs/guide/own-data.md")
+    named(refused(path), path, "transforms.json", "COLMAP", "docs/guide/programs.md")
     assert len(listed(path, cameras="elsewhere").frames) == 4
     assert len(listed(path, cameras="elsewhere/images.txt").frames) == 4
     root = tmp_path / "run"

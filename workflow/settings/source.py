@@ -54,17 +54,18 @@ class PhotographedSource(Section):
 
 
 class FolderSource(PhotographedSource):
-    """A scene of your own: cameras (`transforms.json` or a COLMAP model), images and a mesh in one folder
+    """A scene of your own: cameras of any of several programs (docs/guide/programs.md), images and a mesh in one folder
     (docs/guide/own-data.md)."""
 
     kind: Literal["folder"]
     path: Path
     """The folder."""
     cameras: str | None = None
-    """transforms.json, or the folder of a COLMAP model, inside the folder; by default the first of `transforms.json`, `sparse/0`,
-    `sparse`, `colmap/sparse/0` and `colmap` that exists."""
+    """transforms.json, the folder of a COLMAP model, or cameras of Metashape (.xml) or Meshroom (.sfm) inside the folder; by
+    default the first that exists of `transforms.json`, `cameras.xml`, `cameras.sfm`, `sfm.json`, `sparse/0`, `sparse`,
+    `colmap/sparse/0`, `colmap`, and the raw data of a scanning app."""
     images: str = "images"
-    """COLMAP: folder that the names of its images are relative to."""
+    """COLMAP, Metashape, Meshroom: folder that the names of the images are relative to."""
     mesh: str | None = None
     """Mesh file inside the folder; by default the only one of mesh.ply, mesh.obj and mesh.glb."""
     unit: Literal["m", "cm", "mm", "km", "ft", "in"] | float = "m"

@@ -11,7 +11,7 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.settings.names import did_you_mean_path
-from workflow.sources.folder_scene import colmap, exposure, images, mesh, transforms
+from workflow.sources.folder_scene import apps, colmap, exposure, images, mesh, photogrammetry, transforms
 from workflow.sources.folder_scene.transforms import Frame
 
 TRUTH = ("albedo", "roughness", "metallic", "emission")
@@ -76,20 +76,11 @@ def find_inputs(source: dict[str, Any], capture: dict[str, Any], points: bool = 
         InputError: missing or unusable files, by name.
     """
     metres = transforms.metres_per_unit(source["unit"])
-    folder = transforms.folder_at(source, "transforms.json or a COLMAP model")
-    stated = source["cameras"]
-    model = None
-    if not (str(stated).endswith(".json") or (stated is None and (folder / "transforms.json").is_file())):
-        model = colmap.find(folder, stated)
-        if model is None and stated is None:
-            raise InputError(
-                f"{folder}: neither transforms.json nor a COLMAP model; a `folder` scene needs one of them"
-                f" (docs/guide/own-data.md shows how to make one).{did_you_mean_path(folder / 'transforms.json')}"
-            )
-    listed = transforms.read(source, capture) if model is None else colmap.frames_of(folder, model, source, capture, points)
+    folder = transforms.folder_at(source, "transforms.json, a COLMAP model, or the export of a program")
+    listed, meshes = _cameras(folder, source, capture, points)
     if capture["test_every"] == 1:
         raise InputError("`capture.test_every: 1` keeps every view for testing; give 0 (none) or 2 and more")
-    mesh_path = mesh.find(folder, source.get("mesh"))
+    mesh_path = mesh.find(folder, source.get("mesh"), meshes)
     exposures = folder / "exposures.json"
     has_exposures = exposures.is_file()
     if has_exposures:
@@ -97,6 +88,30 @@ def find_inputs(source: dict[str, Any], capture: dict[str, Any], points: bool = 
     ids, truth = _instances(folder, listed.frames), _truth(folder, listed.frames)
     frames = tuple(replace(f, ids=ids.get(f.name), truth=truth.get(f.name, {})) for f in listed.frames)
     return Inputs(replace(listed, frames=frames), mesh_path, exposures if has_exposures else None, metres)
+
+
+def _cameras(
+    folder: Path, source: dict[str, Any], capture: dict[str, Any], points: bool
+) -> tuple[transforms.Transforms, tuple[str, ...]]:
+    """Read the cameras of a folder, by whichever program wrote them; also the names of meshes that this program exports."""
+    stated = source["cameras"]
+    if str(stated).endswith("transforms.json") or (stated is None and (folder / "transforms.json").is_file()):
+        return transforms.read(source, capture), ()
+    of_program = photogrammetry.find(folder, stated)
+    if of_program is not None:
+        return photogrammetry.frames_of(folder, of_program, source, capture), ()
+    if str(stated).endswith(".json"):
+        return transforms.read(source, capture), ()
+    model = colmap.find(folder, stated)
+    if model is not None:
+        return colmap.frames_of(folder, model, source, capture, points), ()
+    app = apps.find(folder)
+    if app is not None:
+        return apps.frames_of(app, folder, source, capture), apps.MESHES[app]
+    raise InputError(
+        f"{folder}: neither transforms.json nor a COLMAP model, nor cameras of another program that is known"
+        f" (docs/guide/programs.md); a `folder` scene needs one of them.{did_you_mean_path(folder / 'transforms.json')}"
+    )
 
 
 def _instances(folder: Path, frames: tuple[Frame, ...]) -> dict[str, Path]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -90,8 +91,8 @@ class Mesh:
         return float(np.linalg.norm(high - low))
 
 
-def find(folder: Path, name: str | None) -> Path:
-    """Return the mesh file: `source.mesh`, or the only one of mesh.ply, mesh.obj, mesh.glb.
+def find(folder: Path, name: str | None, others: Sequence[str] = ()) -> Path:
+    """Return the mesh file: `source.mesh`, the only one of mesh.ply, mesh.obj, mesh.glb, or the first of `others` that is there.
 
     Raises:
         InputError: no such file, several, or one of another kind.
@@ -106,6 +107,7 @@ def find(folder: Path, name: str | None) -> Path:
         check_mesh(path)
         return path
     found = [folder / n for n in NAMES if (folder / n).is_file()]
+    found = found or [folder / n for n in others if (folder / n).is_file()][:1]
     if len(found) > 1:
         raise InputError(f"{folder}: holds {' and '.join(p.name for p in found)}; choose one with `source.mesh`")
     if not found:
