@@ -1115,8 +1115,8 @@ def test_a_folder_with_a_similar_name_is_suggested(tmp_path):
 
 
 def test_every_example_of_the_guide_is_valid():
-    guide = (PAGE.parents[2] / "docs/guide/own-data.md").read_text()
-    examples = re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL)
+    guide, programs = ((PAGE.parents[2] / f"docs/guide/{name}.md").read_text() for name in ("own-data", "programs"))
+    examples = re.findall(r"```yaml\n(.*?)```", guide + programs, re.DOTALL)
     kinds = {settings.SceneSettings.model_validate(yaml.safe_load(text)).source.kind for text in examples}
     assert kinds == {"folder", "scannetpp", "fipt"}
     matrix = json.loads(re.search(r"```json\n(.*?)```", guide, re.DOTALL)[1])["frames"][0]["transform_matrix"]
