@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from tests.unit import own_scene as own
 from workflow.artifacts import StageReader
 from workflow.exporters.camera_files import cameras_json
 from workflow.exporters.glb import rotation_to_y
-from workflow.scene.normal_form import View, stated_exposures
+from workflow.scene.normal_form import View, stated_exposures, widest
 from workflow.settings.source import FolderSource
 from workflow.sources import folder
 from workflow.sources.folder_scene import alignment, images, mesh, transforms
@@ -399,6 +400,21 @@ def test_capture_matches_the_known_room(scene):
     assert facts["depth_median_disagreement"] < 0.01 and facts["depth_samples"] > 5000
     assert capture.facts["source"] == "folder" and not capture.has_truth
     assert any("reduced to 32x24" in note for note in capture.facts["notes"])
+
+
+def test_the_view_that_shows_most_is_the_widest(tmp_path):
+    """A camera close to the block shows little, whatever comes first; a held-out photograph is not chosen."""
+    path = own.project(tmp_path, source={"registration": "off", "alignment": "off"}, capture={"test_every": 3})
+    document, _ = own.photographed(path, 4, depth=False)
+    for i in (0, 1, 3):  # into a corner of the floor
+        matrix = np.array(document["frames"][i]["transform_matrix"])
+        matrix[:3, 3] = matrix[:3, 3] * 0.1 + np.array([2.9, -0.5, 1.45]) * 0.9
+        document["frames"][i]["transform_matrix"] = matrix.tolist()
+    own.write_transforms(path, document)
+    capture = own.run(tmp_path, "capture")
+    assert capture.views[2].split == "test" and widest(capture).name != "002"
+    capture.views[2] = replace(capture.views[2], split="train")
+    assert widest(capture).name == "002"
 
 
 def test_same_input_same_bytes(scene):

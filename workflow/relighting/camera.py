@@ -12,7 +12,7 @@ from iif_core.camera.pinhole import direction_derivatives, look_at, pixel_direct
 from iif_core.errors import InputError
 from iif_core.light.relighting import camera_path, frame_times
 from workflow.relighting.inventory import check_views
-from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.normal_form import CaptureReader, View, widest
 
 if TYPE_CHECKING:
     from iif_core.light.transport.geometry import Geometry
@@ -58,7 +58,7 @@ def plan_flight(capture: CaptureReader, entry: dict[str, Any], up: Array) -> Fli
         keys = np.stack([look_at(pose["position"], pose["look_at"], up) for pose in camera["poses"]])
         first = _nearest(capture.views, keys[0])
     else:
-        names = camera["views"] or [capture.views[0].name]
+        names = camera["views"] or [widest(capture).name]
         keys, first = np.stack([by_name[name].world_from_camera for name in names]), by_name[names[0]]
     width, height = camera["width"] or first.width, camera["height"] or first.height
     scale = width / first.width

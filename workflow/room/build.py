@@ -209,14 +209,14 @@ def photograph_facts(views: Sequence[View], frame: Frame) -> list[dict[str, Any]
     return facts
 
 
-def start_of(photographs: Sequence[dict[str, Any]], frame: Frame) -> dict[str, Any]:
-    """Return where the page opens: at eye height where the first photograph was taken, looking the same way."""
+def start_of(photographs: Sequence[dict[str, Any]], frame: Frame, widest: int = 0) -> dict[str, Any]:
+    """Return where the page opens: at eye height where the photograph of the given number was taken, looking the same way."""
     tall = max(frame.high[2] - frame.floor, 0.1)
     eye = frame.floor + min(EYE_HEIGHT, 0.7 * tall)
     if not photographs:
         middle = (frame.low + frame.high) / 2
         return {"eye": [middle[0], middle[1], eye], "yaw": 0.0, "pitch": 0.0}
-    first = photographs[0]
+    first = photographs[widest]
     place = np.clip(first["eye"], *walkable(frame))
     yaw = float(np.arctan2(first["direction"][1], first["direction"][0]))
     return {"eye": [float(place[0]), float(place[1]), float(eye)], "yaw": yaw, "pitch": -0.1}

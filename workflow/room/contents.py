@@ -15,7 +15,7 @@ from workflow.room.light import Lamps
 from workflow.room.pack import Blob
 from workflow.room.page import Page, render_page
 from workflow.runtime.job import Job
-from workflow.scene.normal_form import CaptureReader
+from workflow.scene.normal_form import CaptureReader, widest
 from workflow.scene.recovered import Recovered
 
 
@@ -26,7 +26,8 @@ def page_that_fits(
     credit = job.settings.report.credit or str(capture.facts.get("credit", ""))
     allowed = job.settings.room.max_mb
     document["photographs"] = build.photograph_facts(capture.views, frame)
-    document["start"] = build.start_of(document["photographs"], frame)
+    first = [view.name for view in capture.views].index(widest(capture).name)
+    document["start"] = build.start_of(document["photographs"], frame, first)
     sharp = [_photograph(capture, view) for view in capture.views]
     page, previous = b"", None
     for width in build.PHOTOGRAPH_WIDTHS:

@@ -142,6 +142,23 @@ def stated_exposures(facts: Mapping[str, Any], views: Sequence[View]) -> np.ndar
     return np.array([stated.get(view.name, np.nan) for view in views], np.float64) if stated else None
 
 
+WIDE_CELL = 0.2
+"""Edge in metres of the cells of surface by which it is told which photograph shows most."""
+_WIDE_PIXELS = 20_000
+
+
+def widest(capture: CaptureReader) -> View:
+    """Return the view that shows most surface, of those that are not held out; the first of equals."""
+
+    def cells(view: View) -> int:
+        depth, face = capture.gbuffer(view)
+        step = max(1, int(np.sqrt(depth.size / _WIDE_PIXELS)))
+        points = capture.points(view, depth)[::step, ::step][(face >= 0)[::step, ::step]]
+        return len(np.unique(np.floor(points / WIDE_CELL).astype(np.int64), axis=0))
+
+    return max(capture.used or capture.views, key=cells)
+
+
 class CaptureReader:
     """Reads the normal form of a finished capture stage."""
 

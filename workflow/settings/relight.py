@@ -138,7 +138,7 @@ class RelightCamera(Section):
     """A still camera, or a flight between views or poses."""
 
     views: list[str] = Field(default_factory=list)
-    """Names of the views to fly along, or of one view for a still camera; by default the first view."""
+    """Names of the views to fly along, or of one view for a still camera; by default the view that shows most surface."""
     poses: list[RelightPose] = Field(default_factory=list)
     """Positions to fly along, in the place of views."""
     frames: int = Field(1, ge=1, le=10000)
