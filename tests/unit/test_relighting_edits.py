@@ -92,6 +92,14 @@ def test_a_colour_keeps_the_luminance():
         coloured(found, 1.0, [0, 0, 0])
 
 
+def test_colours_may_be_hexadecimal_srgb():
+    """#bc8000 is 188, 128, 0 of 255: linear 0.5029, 0.2159, 0 by IEC 61966-2-1."""
+    linear = pytest.approx((0.50289, 0.21586, 0.0), abs=1e-5)
+    found = entry(lamps={"a": {"colour": "#bc8000"}}, materials={"b": {"albedo": "#BC8000"}, "c": {"tint": "#bc8000"}})
+    assert found["lamps"]["a"]["colour"] == linear
+    assert found["materials"]["b"]["albedo"] == linear and found["materials"]["c"]["tint"] == linear
+
+
 def test_factors_and_colours_are_no_part_of_what_is_traced():
     one = entry(name="a", emitters=0.3, lamps={"bulb": {"factor": 2, "colour": [1, 0, 0]}}, environment="off", exposure=2)
     other = entry(name="b", lamps={3: "off"}, video=False)
@@ -119,6 +127,8 @@ def test_settings_of_lamps_and_paint():
     for bad, *fault in (
         ({"lamps": {"a": -1}}, "lamps.a.factor", least, 0),
         ({"lamps": {"a": {"colour": [0, 0, 0]}}}, "lamps.a.colour", ours, "off"),
+        ({"lamps": {"a": {"colour": "orange"}}}, "lamps.a.colour", ours, "'#c0d8e0'"),
+        ({"materials": {"a": {"albedo": "#c0d8"}}}, "materials.a.albedo", ours, "'#c0d8e0'"),
         ({"materials": {"a": {}}}, "materials.a", ours, "albedo", "tint", "roughness", "metallic"),
         ({"materials": {"a": {"albedo": [0, 0, 0], "tint": [1, 1, 1]}}}, "materials.a", ours, "albedo", "tint"),
         ({"materials": {"a": {"albedo": [2, 0, 0]}}}, "materials.a.albedo.0", most, 1),

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import AfterValidator, AliasChoices, BeforeValidator, Field, field_validator, model_validator
 
 from iif_core.errors import InputError
+from iif_core.numerics.color import linear_from_srgb
 from workflow.intake import limits
 from workflow.intake.pictures import exr_size
 from workflow.settings.by_hand import TEXT_KEYS
@@ -19,8 +22,23 @@ from workflow.settings.section import Section
 
 Light = Annotated[float, Field(ge=0, le=limits.RADIANCE)]
 """Radiance, or a factor on it."""
-Colour = tuple[Light, Light, Light]
 Reflectance = Annotated[float, Field(ge=0, le=1)]
+
+
+def _of_hex(value: Any) -> Any:
+    """Return linear R, G, B of a colour as browsers and paint charts write it, `"#c0d8e0"` in sRGB; other values as they are."""
+    if not isinstance(value, str):
+        return value
+    if not re.fullmatch(r"#[0-9a-fA-F]{6}", value):
+        raise ValueError("Needed: linear R, G, B such as [0.5, 0.2, 0.1], or sRGB in hexadecimal digits, in quotes: '#c0d8e0'")
+    return tuple(linear_from_srgb(np.array([int(value[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0).tolist())
+
+
+Colour = Annotated[tuple[Light, Light, Light], BeforeValidator(_of_hex, json_schema_input_type=tuple[Light, Light, Light] | str)]
+Paint = Annotated[
+    tuple[Reflectance, Reflectance, Reflectance],
+    BeforeValidator(_of_hex, json_schema_input_type=tuple[Reflectance, Reflectance, Reflectance] | str),
+]
 SWITCH = {"on": 1.0, "off": 0.0, True: 1.0, False: 0.0}
 """What `on` and `off`, which YAML reads as booleans, stand for."""
 
@@ -35,7 +53,7 @@ class RelightLamp(Section):
     factor: Annotated[Light, BeforeValidator(_switched)] = 1.0
     """Factor on the radiance that was found; `on` is 1, `off` is 0."""
     colour: Colour | None = Field(None, validation_alias=AliasChoices("colour", "color"))
-    """Linear R, G, B of its light; the luminance stays. By default as found."""
+    """Linear R, G, B of its light, or `"#ffd0a0"` (sRGB); the luminance stays. By default as found."""
     move: tuple[float, float, float] | None = None
     """By how much it is moved, in metres along the world axes."""
 
@@ -57,8 +75,8 @@ class RelightLamp(Section):
 class MaterialEdit(Section):
     """Other paint on one object. What is not named stays as it was recovered."""
 
-    albedo: tuple[Reflectance, Reflectance, Reflectance] | None = None
-    """Linear R, G, B of flat paint; it replaces the texture."""
+    albedo: Paint | None = None
+    """Linear R, G, B of flat paint, or `"#c0d8e0"` (sRGB); it replaces the texture."""
     tint: Colour | None = None
     """Factors on R, G, B of the albedo; the texture stays."""
     roughness: float | None = Field(None, ge=0.02, le=1)
@@ -78,8 +96,8 @@ class MaterialEdit(Section):
 class InsertMaterial(Section):
     """One material for all of an inserted object, in the place of those of its file."""
 
-    albedo: tuple[Reflectance, Reflectance, Reflectance] = (0.5, 0.5, 0.5)
-    """Linear R, G, B."""
+    albedo: Paint = (0.5, 0.5, 0.5)
+    """Linear R, G, B, or `"#c0d8e0"` (sRGB)."""
     roughness: float = Field(0.5, ge=0.02, le=1)
     """Perceptual roughness."""
     metallic: Reflectance = 0.0
