@@ -359,3 +359,13 @@ def test_cameras_of_a_rig_share_names(tmp_path):
     assert [f.name for f in frames] == ["left_cam_0000", "right_cam_0000", "left_cam_0001", "right_cam_0001"]
     fewer = transforms.read(source, {"views": 2, "dynamic_range": "ldr"}).frames
     assert {f.name for f in fewer} <= {f.name for f in frames}  # names do not depend on how many are taken
+
+
+def test_photographs_that_are_missing_are_looked_for_in_all(tmp_path):
+    """A cheap quality takes few photographs, and the next one would fail hours later."""
+    path = own.project(tmp_path)
+    own.bare(path, 8)
+    (path / "images/006.png").unlink()
+    source = {"path": str(path), "cameras": None, "applied_transform": "keep", "alignment": "off"}
+    with refused("006.png"):
+        transforms.read(source, {"views": 2, "dynamic_range": "ldr"})

@@ -249,12 +249,15 @@ def frames_of(
     Raises:
         InputError: at the first fault.
     """
-    raw = choose_entries(_matching(path, _told_apart(entries), source.get("frames")), capture["views"])
+    every = _matching(path, _told_apart(entries), source.get("frames"))
+    found = {id(entry): _find_image(path, root, entry) for entry in every}
+    raw = choose_entries(every, capture["views"])
     if all(entry.split == "test" for entry in raw):
         raise InputError(f"{path}: lists keep all {len(raw)} photographs for testing; at least one must be there to use")
     _unique_names(path, raw)
-    located = [(entry, _find_image(path, root, entry)) for entry in raw]
-    _all_present(path, root, [image for _, image in located if not image.is_file()])
+    # Also those that are not taken: another quality takes others.
+    _all_present(path, root, [image for image in found.values() if not image.is_file()])
+    located = [(entry, found[id(entry)]) for entry in raw]
     _one_range(path, [image for _, image in located], capture["dynamic_range"])
 
     offset = _pixel_offset(path, document, source.get("pixel_centre", "auto"))
