@@ -53,7 +53,7 @@ include: "workflow/rules/unknown.smk"
 onstart:
     choose.keep(REQUEST, CHOSEN)
     tell_costs()
-    keep_own_files()
+    forget_backups()
 
 
 onsuccess:
@@ -61,5 +61,4 @@ onsuccess:
 
 
 onerror:
-    put_back_own_files()
     tell_reasons()

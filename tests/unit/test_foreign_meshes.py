@@ -3,6 +3,7 @@
 import json
 import struct
 
+import DracoPy
 import numpy as np
 import pytest
 import trimesh
@@ -72,6 +73,15 @@ def test_a_doorway_of_quads_stays_open():
     for first in range(4):
         at = np.roll(arrow, first, 0)
         assert 0.5 * np.linalg.norm(areas(at, triangles(at, np.arange(4))), axis=1).sum() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("corners, count", [(10_001, 1), (9_000, 200)])
+def test_polygons_that_would_take_minutes_are_refused(tmp_path, corners, count):
+    lines = [f"v {x!r} {y!r} 0" for x, y in np.random.default_rng(1).random((corners, 2)).tolist()]
+    lines += ["f " + " ".join(map(str, range(1, corners + 1)))] * count
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    with refused("a.obj", corners):
+        read_obj(tmp_path / "a.obj")
 
 
 def test_polygons_without_area_do_not_fail():
@@ -199,6 +209,36 @@ def test_ply_cut_short_is_refused(tmp_path, form, polygons):
         (tmp_path / "a.ply").write_bytes(data[:left])
         with refused("a.ply", "cut short"):
             read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_empty_lists_of_ply(tmp_path, form):
+    """A point cloud, and a mesh with an element of lists that has none."""
+    written = ply(tmp_path / "a.ply", form, [], None)
+    vertices, faces, _ = read_ply(tmp_path / "a.ply")
+    np.testing.assert_array_equal(vertices, written)
+    assert faces.shape == (0, 3)
+    ply(tmp_path / "b.ply", form, MIXED, None)
+    data = (
+        (tmp_path / "b.ply").read_bytes().replace(b"element edge 1\nproperty int", b"element tristrips 0\nproperty list int int")
+    )
+    (tmp_path / "b.ply").write_bytes(data)
+    assert len(read_ply(tmp_path / "b.ply")[1]) == 9
+
+
+def test_a_comment_is_no_end_of_the_header(tmp_path):
+    ply(tmp_path / "a.ply", "ascii")
+    text = (tmp_path / "a.ply").read_text().replace("comment of a test", "comment before end_header")
+    (tmp_path / "a.ply").write_text(text)
+    assert len(read_ply(tmp_path / "a.ply")[1]) == 9
+
+
+def test_corners_that_are_no_integers_are_refused(tmp_path):
+    ply(tmp_path / "a.ply", "ascii", MIXED, None)
+    text = (tmp_path / "a.ply").read_text().replace("\n3 0 1 2\n", "\n3 0 1 2.7\n")
+    (tmp_path / "a.ply").write_text(text)
+    with refused("a.ply"):
+        read_ply(tmp_path / "a.ply")
 
 
 def test_ply_with_impossible_counts_is_refused(tmp_path):
@@ -379,6 +419,62 @@ def test_draco_is_decoded(tmp_path):
     found = mesh.load(tmp_path / "a.glb", 1.0)
     np.testing.assert_allclose(found.bounds, [vertices.min(0), vertices.max(0)], atol=1e-3)
     assert len(found.faces) == len(faces)
+
+
+def test_a_scan_that_draco_has_made_small_is_decoded(tmp_path):
+    """Most have more indices than bytes."""
+    x, y = np.meshgrid(np.linspace(0, 4, 120), np.linspace(0, 3, 120))
+    z = 0.1 * np.sin(x) * y
+    grid = np.arange(120 * 120).reshape(120, 120)
+    a, b, c, d = (part.ravel() for part in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    points = np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float32)
+    data = DracoPy.encode(points, faces.astype(np.uint32), quantization_bits=11, compression_level=10)
+    packed = {"KHR_draco_mesh_compression": {"bufferView": 2, "attributes": {"POSITION": 0}}}
+    primitive = {"attributes": {"POSITION": 0}, "indices": 1, "extensions": packed}
+    arrays = [(points[:1], False, 0), (np.zeros(1, np.uint32), False, 0), (np.frombuffer(data, np.uint8), False, 0)]
+    used = {"extensionsUsed": ["KHR_draco_mesh_compression"], "extensionsRequired": ["KHR_draco_mesh_compression"]}
+    path = glb(tmp_path / "a.glb", [[primitive]], [{"mesh": 0}], arrays, **used)
+
+    def without_buffers(document):
+        for accessor, count in zip(document["accessors"], (len(points), faces.size), strict=False):
+            del accessor["bufferView"]
+            accessor["count"] = count
+        del document["accessors"][2]
+
+    rewritten(path, without_buffers)
+    assert path.stat().st_size < faces.size
+    found = mesh.load(path, 1.0)
+    assert len(found.faces) == len(faces)
+    np.testing.assert_allclose(found.bounds, [points.min(0), points.max(0)], atol=4e-3)
+
+
+def rewritten(path, change):
+    """Change the JSON of a GLB."""
+    data = path.read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    document = json.loads(data[20 : 20 + size])
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + size :]
+    path.write_bytes(struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest)
+
+
+def test_buffers_without_a_file_are_refused(tmp_path):
+    corners = np.eye(3, dtype=np.float32)
+    path = glb(tmp_path / "a.glb", [[{"attributes": {"POSITION": 0}}]], [{"mesh": 0}], [(corners, False, 0)])
+    rewritten(path, lambda document: document.update(buffers=[{"byteLength": 36}] * 100))
+    with refused("a.glb", "buffer 1"):
+        mesh.load(path, 1.0)
+
+
+def test_instances_that_have_other_attributes_alone_stay(tmp_path):
+    corners = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], np.float32)
+    node = {"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {"attributes": {"_ID": 1}}}}
+    arrays = [(corners, False, 0), (np.zeros(1, np.float32), False, 0)]
+    path = glb(tmp_path / "a.glb", [[{"attributes": {"POSITION": 0}}]], [node], arrays)
+    assert len(mesh.load(path, 1.0).faces) == 1
 
 
 @pytest.mark.parametrize("name", ["EXT_meshopt_compression", "VENDOR_new_geometry"])

@@ -15,6 +15,7 @@ from tests.errors import refused
 from tests.unit import own_scene as own
 from workflow.intake.names import existing
 from workflow.sources.folder_scene import borders, images, transforms
+from workflow.sources.folder_scene.photographs import decoded
 from workflow.sources.folder_scene.profiles import SPACES
 
 # -------------------------------------------------------------------------------------------------------- windows of EXR
@@ -42,8 +43,8 @@ def picture(width, height):
 def test_a_crop_stands_where_it_was(tmp_path):
     whole = picture(20, 12)
     path = exr(tmp_path / "a.exr", whole[3:9, 5:18], (5, 3), (20, 12))
-    photo = images.load_photo(path)
-    assert images.header(path).size == (20, 12) and photo.pixels.shape == (12, 20, 3)
+    photo = images.load_photo(path, size=(20, 12))
+    assert images.header(path).shown == (20, 12) and photo.pixels.shape == (12, 20, 3)
     np.testing.assert_array_equal(photo.pixels[3:9, 5:18], whole[3:9, 5:18])
     held = np.zeros((12, 20), bool)
     held[3:9, 5:18] = True
@@ -54,14 +55,14 @@ def test_a_crop_stands_where_it_was(tmp_path):
 def test_overscan_is_cut_off(tmp_path):
     whole = picture(20, 12)
     path = exr(tmp_path / "a.exr", whole, (-4, -2), (12, 8))
-    photo = images.load_photo(path)
+    photo = images.load_photo(path, size=(12, 8))
     np.testing.assert_array_equal(photo.pixels, whole[2:10, 4:16])
     assert photo.valid.all() and photo.outside == 0
-    np.testing.assert_array_equal(images.load_photo(path, whole=True).pixels, whole)
+    np.testing.assert_array_equal(images.load_photo(path).pixels, whole)  # without a camera, all that the file holds
 
 
 def test_a_window_beside_the_picture_holds_nothing_of_it(tmp_path):
-    photo = images.load_photo(exr(tmp_path / "a.exr", picture(6, 4), (100, 100), (10, 8)))
+    photo = images.load_photo(exr(tmp_path / "a.exr", picture(6, 4), (100, 100), (10, 8)), size=(10, 8))
     assert photo.pixels.shape == (8, 10, 3) and not photo.valid.any()
 
 
@@ -79,7 +80,7 @@ def test_cameras_belong_to_the_window_of_their_size(tmp_path, stated, shape):
     source = {"path": str(path), "cameras": None, "applied_transform": "keep", "alignment": "off"}
     frames = transforms.read(source, {"views": 9, "dynamic_range": "hdr"}).frames
     assert {(f.camera.width, f.camera.height, f.camera.fx) for f in frames} == {(*shape, 15.0)}
-    assert images.load_photo(frames[0].image, 1, frames[0].whole).pixels.shape[:2] == shape[::-1]
+    assert decoded(frames[0]).pixels.shape[:2] == shape[::-1]
 
 
 def test_crops_of_different_sizes_share_intrinsics(tmp_path):
@@ -95,6 +96,44 @@ def test_crops_of_different_sizes_share_intrinsics(tmp_path):
         photo, valid = capture.photo(view)
         assert valid[2 * i :, 3 * i :].all() and not valid[: 2 * i].any() and not valid[:, : 3 * i].any()
         np.testing.assert_allclose(photo[valid], shots[i][1][valid], atol=2e-5)
+
+
+@pytest.mark.parametrize("place, display", [((10, 6), (100, 80)), ((-4, -2), (56, 44))])
+def test_depth_ids_and_truth_follow_the_window_of_the_photograph(tmp_path, place, display):
+    """Cameras that belong to the data window: of a crop or of overscan."""
+    path = own.project(tmp_path, source={"registration": "off"}, capture={"dynamic_range": "hdr"})
+    document, shots = own.photographed(path, 3, depth=False, hdr=True)
+    for i, (_, shot, depth, face) in enumerate(shots):
+        exr(path / f"images/{i:03d}.exr", shot, place, display)
+        grey = np.repeat(depth[..., None], 3, -1)
+        exr(path / f"depth/{i:03d}.exr", grey, place, display)
+        document["frames"][i]["depth_file_path"] = f"depth/{i:03d}.exr"
+        for kind, value in (("albedo", 0.25), ("emission", 0.0), ("roughness", 0.5), ("metallic", 0.0)):
+            exr(path / f"truth/{kind}/{i:03d}.exr", np.full_like(shot, value), place, display)
+        header = {
+            "dataWindow": (place, (place[0] + 63, place[1] + 47)),
+            "displayWindow": ((0, 0), (display[0] - 1, display[1] - 1)),
+        }
+        header = {k: tuple(np.array(c, np.int32) for c in v) for k, v in header.items()} | {"type": OpenEXR.scanlineimage}
+        (path / "instances").mkdir(exist_ok=True)
+        with OpenEXR.File(header, {"Y": (face // 12).astype(np.uint32)}) as file:
+            file.write(str(path / f"instances/{i:03d}.exr"))
+    own.write_transforms(path, document)
+    capture = own.run(tmp_path, "capture")
+    assert capture.facts["alignment"]["depth_median_disagreement"] < 1e-3
+    for view, (_, _, _, face) in zip(capture, shots, strict=True):
+        assert (capture.truth(view).albedo == 0.25).all() and capture.photo(view)[1].all()
+        np.testing.assert_array_equal(capture.given_instances(view), face // 12)
+
+
+def test_integers_that_a_crop_lacks_are_not_valid(tmp_path):
+    header = {"dataWindow": ((2, 1), (3, 2)), "displayWindow": ((0, 0), (4, 3)), "type": OpenEXR.scanlineimage}
+    header = {k: tuple(np.array(c, np.int32) for c in v) if "Window" in k else v for k, v in header.items()}
+    with OpenEXR.File(header, {c: np.ones((2, 2), np.uint32) for c in "RGB"}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    photo = images.load_photo(tmp_path / "a.exr", size=(5, 4))
+    assert photo.valid.sum() == 4 and (photo.pixels[~photo.valid] == 0).all()
+    assert (photo.outside, photo.non_finite) == (16, 0)
 
 
 # --------------------------------------------------------------------------------------------------- colours of PNG, JPEG
@@ -202,6 +241,45 @@ def test_adobe_rgb_by_exif_alone(tmp_path):
     assert images.load_photo(tmp_path / "b.jpg").form == ""
 
 
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("alpha", [False, True])
+def test_a_linear_grey_png(tmp_path, bits, alpha):
+    kind = np.uint8 if bits == 8 else ">u2"
+    rows = np.rint(LIGHT[..., :1] * (2**bits - 1)).astype(kind)
+    rows = np.concatenate([rows, np.full_like(rows, 2**bits - 1)], -1).astype(kind) if alpha else rows
+
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    head = struct.pack(">IIBBBBB", 8, 8, bits, 4 if alpha else 0, 0, 0, 0)
+    raw = b"".join(b"\0" + row.tobytes() for row in rows)
+    parts = [chunk(b"IHDR", head), chunk(*gama(1.0)), chunk(b"IDAT", zlib.compress(raw)), chunk(b"IEND", b"")]
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+    photo = images.load_photo(tmp_path / "a.png")
+    agrees(photo, np.repeat(LIGHT[..., :1], 3, -1), atol=0.01 if bits == 8 else 2e-4)
+    assert "grey" in photo.form and "gamma 1" in photo.form
+    plain = images.load_photo(tmp_path / "a.png", colour="srgb")
+    np.testing.assert_allclose(plain.pixels[..., 0], LIGHT[..., 0], atol=0.01)
+    assert "gamma" not in plain.form
+
+
+def test_code_points_of_png_outrank_a_profile(tmp_path):
+    from tests.unit.test_profiles import WIDE
+
+    profile = zlib.compress(WIDE)
+    chunks = [(b"cICP", bytes([1, 13, 0, 1])), (b"iCCP", b"wide\0\0" + profile)]
+    agrees(images.load_photo(png(tmp_path / "a.png", srgb_from_linear(LIGHT), chunks, 8)), atol=0.01)
+    agrees(images.load_photo(png(tmp_path / "b.png", srgb_from_linear(LIGHT), chunks)), atol=2e-4)
+
+
+def test_what_a_prediction_says_of_its_colours_does_not_count(tmp_path):
+    """Its encoding is a setting; a roughness of 0.2 is 0.2."""
+    from workflow.priors import files
+
+    path = png(tmp_path / "a.png", LIGHT, [gama(1.0), chrm("display_p3")])
+    np.testing.assert_allclose(files.load(path, 8, 8, False), LIGHT, atol=1e-4)
+
+
 @pytest.mark.parametrize("name", sorted(SPACES))
 def test_the_setting_overrides_what_a_file_says(tmp_path, name):
     space = SPACES[name]
@@ -278,6 +356,22 @@ def dark_corner(i):
     out = np.zeros((48, 64), bool)
     out[:10, 10 * i : 10 * i + 12] = True
     return out
+
+
+def night(i):
+    """All but a lit patch that is elsewhere in each photograph."""
+    out = np.ones((48, 64), bool)
+    row, column = np.random.default_rng(i).integers((4, 4), (28, 40))
+    out[row : row + 16, column : column + 20] = False
+    return out
+
+
+def test_a_night_with_a_lamp_keeps_what_is_lit(tmp_path):
+    from scipy.ndimage import binary_erosion
+
+    capture = bordered(tmp_path, night, 12)
+    for i, view in enumerate(capture):
+        assert capture.photo(view)[1][binary_erosion(~night(i), iterations=borders.RIM)].all()
 
 
 @pytest.mark.parametrize("hidden", [in_the_middle, of_some, dark_corner])
@@ -357,6 +451,8 @@ def test_cameras_of_a_rig_share_names(tmp_path):
     source = {"path": str(path), "cameras": None, "applied_transform": "keep", "alignment": "off"}
     frames = transforms.read(source, {"views": 9, "dynamic_range": "ldr"}).frames
     assert [f.name for f in frames] == ["left_cam_0000", "right_cam_0000", "left_cam_0001", "right_cam_0001"]
+    one = transforms.read(source | {"frames": "images/left/*"}, {"views": 9, "dynamic_range": "ldr"}).frames
+    assert [f.name for f in one] == ["0000", "0001"]  # alone, they need no more
     fewer = transforms.read(source, {"views": 2, "dynamic_range": "ldr"}).frames
     assert {f.name for f in fewer} <= {f.name for f in frames}  # names do not depend on how many are taken
 
@@ -369,3 +465,17 @@ def test_photographs_that_are_missing_are_looked_for_in_all(tmp_path):
     source = {"path": str(path), "cameras": None, "applied_transform": "keep", "alignment": "off"}
     with refused("006.png"):
         transforms.read(source, {"views": 2, "dynamic_range": "ldr"})
+
+
+def test_depth_of_another_shape_is_refused(tmp_path):
+    path = own.project(tmp_path)
+    document = own.bare(path)
+    document["frames"][1]["depth_file_path"] = "depth/1.png"
+    own.write_transforms(path, document)
+    source = {"path": str(path), "cameras": None, "applied_transform": "keep", "alignment": "off"}
+    own.save_depth(path / "depth/1.png", np.ones((24, 32)))
+    transforms.read(source, {"views": 9, "dynamic_range": "ldr"})
+    own.save_depth(path / "depth/1.png", np.ones((24, 24)))
+    images._header.cache_clear()
+    with refused("1.png", "24x24", "64x48", "depth_intrinsics"):
+        transforms.read(source, {"views": 9, "dynamic_range": "ldr"})

@@ -1,4 +1,4 @@
-"""Files that people put into a deliverable: set apart, put back, never lost, whatever is killed between."""
+"""Files that people put into a deliverable are carried into the next one, and never lost, whatever is killed between."""
 
 import json
 import shutil
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.errors import refused
-from workflow.artifacts import kept
+from workflow.artifacts import kept, swap
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.manifest import SCENE_SCHEMA
 from workflow.trade import choose
@@ -16,86 +16,90 @@ from workflow.trade import choose
 WRITTEN = ("scene.glb", "maps/000.exr")
 
 
-def published(target, version=0):
+def published(target, version=0, names=WRITTEN):
     """A deliverable as stage publish leaves it."""
     shutil.rmtree(target, ignore_errors=True)
-    for name in WRITTEN:
+    for name in names:
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         (target / name).write_text(f"{name} {version}")
-    files = {name: {"sha256": "0" * 64, "bytes": 1} for name in WRITTEN}
+    files = {name: {"sha256": "0" * 64, "bytes": 1} for name in names}
     manifests.write(target / "manifest.json", {"schema": SCENE_SCHEMA, "files": files}, settled=False)
 
 
-NAMES = st.sampled_from(["room.blend", "renders/a.png", "renders/deep/b.png", "maps/c.txt", ".hidden", "scene.usda"])
-STEPS = st.lists(
-    st.one_of(st.tuples(st.just("put"), NAMES), st.sampled_from(["again", "killed", "fails", "replaced"])), max_size=12
+NAMES = st.sampled_from(
+    ["room.blend", "renders/a.png", "renders/deep/b.png", "maps/c.txt", ".hidden", "extra.usda", "extra.own.usda"]
 )
+STEPS = st.lists(st.one_of(st.tuples(st.just("put"), NAMES), st.sampled_from(["again", "killed", "more"])), max_size=12)
 
 
-@settings(max_examples=40, deadline=None)
+def texts(*folders):
+    return [path.read_text() for folder in folders for path in folder.rglob("*") if path.is_file()]
+
+
+@settings(max_examples=60, deadline=None)
 @given(STEPS)
 def test_nothing_is_lost_in_any_order(tmp_path_factory, steps):
+    """Put files, publish, be killed after either rename, and publish names that the user took first."""
     target = tmp_path_factory.mktemp("s") / "scenes/room"
     published(target)
-    mine = {}
+    mine, written = set(), list(WRITTEN)
     for version, step in enumerate(steps, 1):
         if isinstance(step, tuple):
-            if not target.exists():
+            place = target / step[1]
+            place.parent.mkdir(parents=True, exist_ok=True)
+            if step[1] in written:
                 continue
-            (target / step[1]).parent.mkdir(parents=True, exist_ok=True)
-            (target / step[1]).write_text(f"mine {version}")
-            mine[step[1]] = f"mine {version}"
-        elif step == "again":  # hook, Snakemake removes the folder, the job publishes and puts back
-            kept.set_apart(target)
-            published(target, version)
-            kept.put_back(target)
-        elif step == "killed":  # between the hook and the end
-            kept.set_apart(target)
-        elif step == "fails":  # the folder is gone, and the hook for failed runs puts back
-            kept.set_apart(target)
-            shutil.rmtree(target, ignore_errors=True)
-            kept.put_back(target)
-        else:  # published by hand after a killed run
-            kept.set_apart(target)
-            published(target, version)
-            kept.put_back(target)
-        where = [target, kept.place_of(target)]
-        found = {name: [(folder / name).read_text() for folder in where if (folder / name).is_file()] for name in mine}
-        assert all(mine[name] in texts for name, texts in found.items()), (step, found, mine)
-    kept.set_apart(target)
-    published(target, 99)
-    kept.put_back(target)
-    assert {name: (target / name).read_text() for name in mine} == mine
-    assert [(target / name).read_text() for name in WRITTEN] == [f"{name} 99" for name in WRITTEN]
-    assert not kept.place_of(target).exists()
+            mine.discard(place.read_text() if place.is_file() else "")  # what the user overwrites is the user's to lose
+            place.write_text(f"mine {version}")
+            mine.add(f"mine {version}")
+        elif step == "more":
+            written.append("extra.usda")
+        else:
+            temporary = target.with_name(".room.tmp")
+            published(temporary, version, written)
+            if step == "killed":  # between the two renames and what follows
+                kept.carry(swap.set_aside(target), target)
+                shutil.rmtree(swap.set_aside(target), ignore_errors=True)
+                target.rename(swap.set_aside(target))
+                temporary.rename(target)
+            else:
+                swap.replace(temporary, target)
+        assert mine <= set(texts(target, swap.set_aside(target))), (step, mine)
+    published(target.with_name(".room.tmp"), 99, written)
+    swap.replace(target.with_name(".room.tmp"), target)
+    assert mine <= set(texts(target)) and not swap.set_aside(target).exists()
+    assert [(target / name).read_text() for name in written] == [f"{name} 99" for name in written]
 
 
 def test_without_a_manifest_the_record_of_the_stage_tells_what_was_published(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    target = tmp_path / "scenes/room"
+    old, target = tmp_path / "scenes/.room.old", tmp_path / "scenes/room"
+    published(old, names=[*WRITTEN, "dropped.json"])
+    (old / "manifest.json").unlink()
+    (old / "mine.txt").write_text("mine")
     published(target)
-    (target / "manifest.json").unlink()
-    (target / "mine.txt").write_text("mine")
     (tmp_path / "results/room/publish").mkdir(parents=True)
-    (tmp_path / "results/room/publish/published.json").write_text(json.dumps({"files": dict.fromkeys(WRITTEN, "0")}))
-    assert kept.set_apart(target) == ["mine.txt"]
+    (tmp_path / "results/room/publish/published.json").write_text(json.dumps({"files": {"dropped.json": "0"}}))
+    assert kept.carry(old, target) == ["mine.txt"]
 
 
-def test_a_name_that_the_workflow_takes_later_is_kept_beside(tmp_path):
-    target = tmp_path / "room"
-    published(target)
-    (target / "scene.usda").write_text("mine")
-    kept.set_apart(target)
-    published(target, 2)
-    (target / "scene.usda").write_text("of the workflow")
-    kept.put_back(target)
-    assert (target / "scene.own.usda").read_text() == "mine" and (target / "scene.usda").read_text() == "of the workflow"
+def test_names_that_are_taken_are_counted(tmp_path):
+    old, target = tmp_path / "old", tmp_path / "room"
+    published(old)
+    for name in ("extra.usda", "extra.own.usda"):
+        (old / name).write_text(f"mine {name}")
+    published(target, names=[*WRITTEN, "extra.usda"])
+    assert kept.carry(old, target) == ["extra.own.usda", "extra.own2.usda"]
+    assert (target / "extra.own.usda").read_text() == "mine extra.own.usda"
+    assert (target / "extra.own2.usda").read_text() == "mine extra.usda"
 
 
-def test_nothing_to_keep_leaves_no_trace(tmp_path):
-    assert kept.set_apart(tmp_path / "none") == [] and kept.put_back(tmp_path / "none") == []
+def test_what_snakemake_leaves_is_not_the_users(tmp_path):
+    published(tmp_path / "old")
     published(tmp_path / "room")
-    assert kept.set_apart(tmp_path / "room") == [] and not kept.place_of(tmp_path / "room").exists()
+    (tmp_path / "old/.snakemake_timestamp").touch()
+    assert kept.carry(tmp_path / "old", tmp_path / "room") == []
+    assert kept.carry(tmp_path / "none", tmp_path / "room") == []
 
 
 # ------------------------------------------------------------------------------------------- a cheaper quality asks first

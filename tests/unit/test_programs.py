@@ -101,6 +101,31 @@ def test_polycam(tmp_path, shots, corrected, aligned):
     assert any("not optimised" in note for note in capture.facts["notes"]) is not corrected
 
 
+def test_polycam_without_what_it_says_of_its_mesh(tmp_path, shots):
+    path, world = polycam(tmp_path, shots, aligned=False)
+    (path / "mesh_info.json").unlink()
+    capture = agrees(tmp_path, shots, world)
+    assert capture.facts["alignment"]["depth_median_disagreement"] < 0.01
+
+
+@pytest.mark.parametrize(
+    "turn", [[float("nan")] * 16, [0.0] * 16, [-1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], [1.0], {"a": 1}]
+)
+def test_an_alignment_that_is_none_is_refused(tmp_path, shots, turn):
+    path, _ = polycam(tmp_path, shots)
+    (path / "mesh_info.json").write_text(json.dumps({"alignmentTransform": turn}))
+    with refused("mesh_info.json"):
+        own.run(tmp_path, "capture")
+
+
+@pytest.mark.parametrize("which", ["mesh_info.json", "keyframes/corrected_cameras/1442008525605.json"])
+def test_documents_of_another_kind_are_refused(tmp_path, shots, which):
+    path, _ = polycam(tmp_path, shots)
+    (path / which).write_text("[]")
+    with refused(which.rpartition("/")[2], "list"):
+        own.run(tmp_path, "capture")
+
+
 def test_every_file_of_polycam_counts_for_the_fingerprint(tmp_path, shots):
     path, _ = polycam(tmp_path, shots)
     source = {"path": str(path), "cameras": None, "unit": "m", "mesh": None, "alignment": "check", "images": "images"}
@@ -253,6 +278,17 @@ def test_the_lens_of_metashape_has_its_tangential_numbers_the_other_way(tmp_path
 def test_what_metashape_has_and_is_not_read_is_refused_by_name(tmp_path, shots, options, said):
     metashape(tmp_path, shots, **options)
     with refused("cameras.xml", said):
+        own.run(tmp_path, "capture")
+
+
+def test_a_calibration_without_a_focal_length_and_a_label_that_is_no_name(tmp_path, shots):
+    path = metashape(tmp_path, shots)
+    text = (path / "cameras.xml").read_text()
+    (path / "cameras.xml").write_text(text.replace("<f>62.0</f>", "<fx>62.0</fx><fy>62.0</fy>"))
+    with refused("cameras.xml", "`f`"):
+        own.run(tmp_path, "capture")
+    (path / "cameras.xml").write_text(text.replace("label='000'", f"label='{'0' * 300}'"))
+    with refused("cameras.xml"):
         own.run(tmp_path, "capture")
 
 

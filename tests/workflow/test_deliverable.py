@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-from workflow.artifacts import kept
+from workflow.artifacts import swap
 
 FILES = """scene.glb mitsuba/scene.xml mitsuba/render.py objects.parquet objects.csv emitters.parquet plan.yaml verdict.json
 metrics.parquet timings.parquet report.html room.html scene_unlit.glb scene.usdc manifest.json""".split()
@@ -97,13 +97,14 @@ def test_files_of_the_user_outlive_a_new_deliverable(workflow):
 
 
 def test_files_of_the_user_outlive_a_run_that_was_killed(workflow):
-    scene = workflow.folder / "scenes/tiny"
+    scene, snakemake = workflow.folder / "scenes/tiny", workflow.folder / ".snakemake"
     put(scene)
-    kept.set_apart(scene)
-    shutil.rmtree(scene)  # as Snakemake does before the job that publishes, which then is killed
+    shutil.copytree(scene, snakemake / "backups/scenes/tiny", symlinks=True)  # as Snakemake leaves it
+    scene.rename(swap.set_aside(scene))  # between the two renames
     result = workflow.run("scenes/tiny")
     assert result.returncode == 0, result.stderr[-4000:]
     assert has_own(scene) and (scene / "report.html").is_file()
+    assert not list(scene.parent.glob(".*")) and not (snakemake / "backups/scenes/tiny").exists()
 
 
 def test_files_of_the_user_outlive_a_job_that_fails(workflow):
@@ -114,4 +115,14 @@ def test_files_of_the_user_outlive_a_job_that_fails(workflow):
     record.write_text("a file where the stage writes its folder")
     result = workflow.run("scenes/tiny", "--forcerun", "publish")
     assert result.returncode != 0
-    assert has_own(scene)
+    assert has_own(scene) and (scene / "report.html").is_file()
+
+
+def test_files_that_are_put_there_while_stages_run_are_kept(workflow):
+    """Long after Snakemake has planned: here by the report, the last stage before."""
+    scene = workflow.folder / "scenes/tiny"
+    (workflow.folder / "config/scenes/tiny.yaml").open("a").write("report: {credit: someone}\n")
+    put(scene)
+    result = workflow.run("scenes/tiny")
+    assert result.returncode == 0, result.stderr[-4000:]
+    assert has_own(scene) and "someone" in (scene / "report.html").read_text()

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.files import flush_folder
+from workflow.artifacts.kept import carry
 from workflow.artifacts.manifest import MANIFEST, SCENE_SCHEMA
 from workflow.artifacts.sound import wrong_files
 
@@ -35,19 +36,23 @@ def bring_back(target: Path) -> None:
         flush_folder(target.parent)
 
 
-def replace(temporary: Path, target: Path) -> None:
-    """Rename a folder into the place of a deliverable. Snakemake has removed the old one unless the stage is run by hand.
+def replace(temporary: Path, target: Path) -> list[str]:
+    """Rename a folder into the place of a deliverable; carry over what the user has put there, and return its names.
 
-    At every moment, and after a power cut at any, the old folder or the new one is complete, here or set aside.
+    At every moment, and after a power cut at any, the old folder or the new one is complete, here or set aside, and whatever is
+    the user's is in one of them.
     """
     old = set_aside(target)
+    carry(old, target)  # of a job that was killed below
     _discard(old)
     if target.exists():
         os.rename(target, old)
         flush_folder(target.parent)
     os.rename(temporary, target)
     flush_folder(target.parent)
+    own = carry(old, target)
     _discard(old)
+    return own
 
 
 def _discard(old: Path) -> None:

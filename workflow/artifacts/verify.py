@@ -9,14 +9,12 @@ from typing import Any
 from workflow.artifacts import files as io
 from workflow.artifacts import links
 from workflow.artifacts import manifest as manifests
+from workflow.artifacts.kept import OF_SNAKEMAKE
 from workflow.artifacts.manifest import MANIFEST, SCENE_SCHEMA, STAGE_SCHEMA
 from workflow.artifacts.sound import forget, made_from_another, of_another, wrong_files
 from workflow.artifacts.stamps import place
 from workflow.artifacts.store import PARTS, chosen, command, quality_in
 from workflow.registry import SHARED, STAGES
-
-OF_SNAKEMAKE = ".snakemake_timestamp"
-"""What Snakemake leaves in a folder that is an output."""
 
 
 def with_artefacts(root: Path = Path(".")) -> list[str]:
@@ -110,6 +108,8 @@ def _folder(folder: Path, schema: str, owner: dict[str, str], first: str = "") -
         if path.is_dir() and not path.is_symlink():
             continue
         if name not in listed:
+            if "stage" not in owner:
+                continue  # of the user, and carried over when this is made again
             lost = "move it away, or it is lost when this is made again"
             yield f"{path}: not written by rule {stage} (not in {folder / MANIFEST}); {lost}"
         elif path.is_symlink():

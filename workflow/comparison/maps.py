@@ -142,7 +142,7 @@ def read_map(maps: Maps, quantity: str, view: View, srgb: bool | None = None) ->
     elif exr:
         values = images.load_map(path, 3 if three else 1)
     else:
-        loaded = images.load_photo(path).pixels
+        loaded = images.load_photo(path, colour="srgb").pixels  # as it is: whoever asks says how it is encoded
         values = loaded if three else loaded[..., 0]
     bad = int(np.size(values) - np.isfinite(values).sum())
     if bad:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 from iif_core.errors import InputError
 from workflow.intake import limits
 from workflow.intake.documents import read_bytes, reading, shorter
-from workflow.intake.meshes import AGAIN, check_gltf
+from workflow.intake.meshes import AGAIN, check_faces, check_gltf
 
 QUANTISED, INSTANCED, DRACO = "KHR_mesh_quantization", "EXT_mesh_gpu_instancing", "KHR_draco_mesh_compression"
 _GEOMETRY = (QUANTISED, INSTANCED, DRACO)
@@ -118,6 +118,7 @@ class _Plain:
     document: Document
     buffers: list[bytes]
     added: list[bytes] = field(default_factory=list)
+    grown: int = 0
 
     def values(self, number: Any) -> np.ndarray:
         """Return an accessor (count, width) as it is meant: normalised integers are divided, sparse entries replaced."""
@@ -161,7 +162,10 @@ class _Plain:
     def add(self, values: np.ndarray, accessor: Document) -> int:
         """Append an array as a new accessor, and return its number."""
         data = np.ascontiguousarray(values).tobytes()
-        at = len(self.buffers[0]) + sum(map(len, self.added))
+        at = len(self.buffers[0]) + self.grown
+        self.grown += len(data) + -len(data) % 4
+        if self.grown > limits.MESH_BYTES:
+            raise InputError(f"{self.path}: its attributes take more than {limits.MESH_BYTES} bytes. Simplify the mesh")
         self.document.setdefault("bufferViews", []).append({"buffer": 0, "byteOffset": at, "byteLength": len(data)})
         self.added.append(data + b"\0" * (-len(data) % 4))
         kind = "SCALAR" if values.shape[1] == 1 else f"VEC{values.shape[1]}"
@@ -193,6 +197,7 @@ class _Plain:
             index = self.values(primitive["indices"])[:, 0].astype(np.int64)
         else:
             index = np.arange(self._entry("accessors", attributes["POSITION"])["count"])
+        check_faces(self.path, self.grown // 12 + len(index))
         triangles = _of_fan(index) if mode == _FAN else _of_strip(index)
         number = self.add(triangles.reshape(-1, 1).astype(np.uint32), {"componentType": _UNSIGNED})
         primitive |= {"mode": _TRIANGLES, "indices": number}
@@ -202,8 +207,9 @@ class _Plain:
         own = node.get("extensions", {}).get(INSTANCED)
         if not isinstance(own, dict) or "mesh" not in node:
             return
-        named = {key.lower(): self.values(number) for key, number in own.get("attributes", {}).items() if key in _PLACES}
-        count = min((len(values) for values in named.values()), default=0)
+        attributes = own.get("attributes", {})
+        count = min((self._entry("accessors", number)["count"] for number in attributes.values()), default=0)
+        named = {key.lower(): self.values(number) for key, number in attributes.items() if key in _PLACES}
         if len(nodes) + count > _MOST_INSTANCES:
             raise InputError(f"{self.path}: {count} instances of a mesh; allowed are {_MOST_INSTANCES} in all")
         mesh, name = node.pop("mesh"), node.get("name", "instance")
@@ -238,7 +244,7 @@ def plain_glb(path: Path) -> bytes:
     document, binary, _ = document_of(path)
     refuse_extensions(path, document)
     with reading(path, "not readable as glTF", "; export the mesh again"):
-        buffers = [_buffer(path, entry, binary) for entry in document.get("buffers", [])] or [b""]
+        buffers = list(_buffers(path, document.get("buffers", []), binary)) or [b""]
         check_gltf(path, document, sum(map(len, buffers)))
         out = _Plain(path, document, [buffers[0] + b"\0" * (-len(buffers[0]) % 4), *buffers[1:]])
         done: dict[int, int] = {}
@@ -254,22 +260,36 @@ def plain_glb(path: Path) -> bytes:
         return _written(out)
 
 
-def _buffer(path: Path, entry: Document, binary: bytes) -> bytes:
-    uri = entry.get("uri")
-    if uri is None:
-        return binary
-    if not uri.startswith("data:"):
-        return read_bytes(path.parent / unquote(uri), limits.MESH_BYTES, "a buffer")
-    head, _, data = uri.partition(",")
-    return base64.b64decode(data) if head.endswith(";base64") else unquote_to_bytes(data)
+def _buffers(path: Path, entries: list[Document], binary: bytes) -> Iterator[bytes]:
+    """The bytes of each buffer; the first alone may be the binary part of the file (glTF 2.0, 3.6.1.1)."""
+    total, known = 0, {}
+    for number, entry in enumerate(entries):
+        uri = entry.get("uri")
+        if uri is None and number:
+            raise InputError(f"{path}: buffer {number} names no file; {AGAIN}")
+        if uri is None:
+            data = binary
+        elif not uri.startswith("data:"):
+            place = path.parent / unquote(uri)
+            data = known[place] = known.get(place) or read_bytes(place, limits.MESH_BYTES, "a buffer")
+        else:
+            head, _, text = uri.partition(",")
+            data = base64.b64decode(text) if head.endswith(";base64") else unquote_to_bytes(text)
+        total += len(data)
+        if total > limits.MESH_BYTES:
+            raise InputError(f"{path}: its buffers have more than {limits.MESH_BYTES} bytes. Simplify the mesh")
+        yield data
 
 
 def _written(plain: _Plain) -> bytes:
     """Return a GLB with all buffers in its binary part."""
-    document, starts, joined = plain.document, [0], plain.buffers[0] + b"".join(plain.added)
+    document, starts, parts = plain.document, [0], [plain.buffers[0], *plain.added]
+    length = len(plain.buffers[0]) + plain.grown
     for buffer in plain.buffers[1:]:
-        starts.append(len(joined))
-        joined += buffer + b"\0" * (-len(buffer) % 4)
+        starts.append(length)
+        parts += [buffer, b"\0" * (-len(buffer) % 4)]
+        length += len(parts[-2]) + len(parts[-1])
+    joined = b"".join(parts)
     for view in document.get("bufferViews", []):
         view["byteOffset"] = view.get("byteOffset", 0) + starts[view.get("buffer", 0)]
         view["buffer"] = 0

@@ -49,13 +49,13 @@ def forward(path: str) -> str:
 def existing(path: Path) -> Path:
     """Return `path`, or where nothing is there the one file whose name differs in capital letters, or in how its letters are
     composed, alone: such names come from systems that do not tell them apart."""
-    if path.exists() or path.parent == path:
-        return path
-    folder = existing(path.parent)
     try:
+        if path.exists() or path.parent == path:
+            return path
+        folder = existing(path.parent)
         stamp = folder.stat().st_mtime_ns if folder.is_dir() else None
-    except OSError:
-        stamp = None
+    except OSError:  # a name that no file can have
+        return path
     found = _listed(folder, stamp).get(same_name(path.name), ()) if stamp is not None else ()
     return folder / found[0] if len(found) == 1 else path
 

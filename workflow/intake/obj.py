@@ -9,7 +9,7 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.intake.meshes import AGAIN, check_faces
-from workflow.intake.polygons import triangulated
+from workflow.intake.polygons import naming, triangulated
 
 Array = np.ndarray
 
@@ -65,4 +65,5 @@ def _faces(path: Path, lines: list[bytes], which: list[int], above: Array, verti
     check_faces(path, int(np.maximum(count - 2, 0).sum()))
     start = np.cumsum(count) - count
     some = ((k, np.flatnonzero(count == k)) for k in np.unique(count))
-    return triangulated(vertices, [(own, flat[start[own][:, None] + np.arange(k)]) for k, own in some])[0]
+    with naming(path):
+        return triangulated(vertices, [(own, flat[start[own][:, None] + np.arange(k)]) for k, own in some])[0]

@@ -95,6 +95,11 @@ class ExrWindows(NamedTuple):
     display: tuple[int, int]
     place: tuple[int, int]
 
+    @property
+    def is_plain(self) -> bool:
+        """The file holds the picture, and nothing else."""
+        return self.data == self.display and self.place == (0, 0)
+
 
 def exr_windows(path: Path) -> ExrWindows:
     """Return data and display window of an EXR from its header.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.intake.meshes import AGAIN, check_faces
-from workflow.intake.polygons import triangulated
+from workflow.intake.polygons import naming, triangulated
 
 Array = np.ndarray
 _KINDS = {
@@ -46,9 +47,11 @@ def read_ply(path: Path) -> tuple[Array, Array, Array | None]:
         InputError: no vertices with x, y, z; the data end before the header says so; a face names a vertex that is not there.
     """
     data = path.read_bytes()
-    end = data.find(b"end_header")
-    body = data.find(b"\n", end) + 1
-    order, elements = _header(path, data[:end])
+    mark = re.search(rb"^end_header[^\n]*\n?", data, re.MULTILINE)
+    if mark is None:
+        raise InputError(f"{path}: cut short (its header has no end); {AGAIN}")
+    body = mark.end()
+    order, elements = _header(path, data[: mark.start()])
     vertices, ids = None, None
     polygons: list[tuple[Array, Array]] = []
     source = _Words(path, data[body:]) if order == "ascii" else _Bytes(path, data, body, order)
@@ -67,7 +70,8 @@ def read_ply(path: Path) -> tuple[Array, Array, Array | None]:
         if corners.size and (corners.min() < 0 or corners.max() >= len(vertices)):
             raise InputError(f"{path}: faces name vertices {corners.min()} ... {corners.max()}, it has 0 ... {len(vertices) - 1}")
     check_faces(path, sum(len(own) * max(own.shape[1] - 2, 0) for _, own in polygons))
-    faces, place = triangulated(vertices, polygons)
+    with naming(path):
+        faces, place = triangulated(vertices, polygons)
     return vertices, faces, None if ids is None else ids[place].astype(np.float64)
 
 
@@ -110,6 +114,8 @@ class _Bytes:
             self.at += record.itemsize * element.count
             return {name: rows[f"{i}"] for i, (name, _, _) in enumerate(element.properties)}, {}
 
+        if not element.count:
+            return {}, {}
         even = self._even(element)
         if even is not None:
             return even
@@ -217,9 +223,7 @@ class _Words:
                 places.append(row)
                 entries.append(self._next(int(value)))
         lists = {
-            name: [
-                (np.array(rows), np.array(own).reshape(len(rows), k).astype(np.int64)) for k, (rows, own) in sorted(some.items())
-            ]
+            name: [(np.array(rows), self._whole(np.array(own).reshape(len(rows), k))) for k, (rows, own) in sorted(some.items())]
             for name, some in found.items()
         }
         return {name: np.array(values) for name, values in scalars.items()}, lists
@@ -240,11 +244,16 @@ class _Words:
             if counted and (rows[:, start] != count).any():
                 return None
             if counted:
-                lists[name] = [(every, rows[:, start + 1 : start + 1 + count].astype(np.int64))]
+                lists[name] = [(every, self._whole(rows[:, start + 1 : start + 1 + count]))]
             else:
                 scalars[name] = rows[:, start]
         self.at += width * element.count
         return scalars, lists
+
+    def _whole(self, values: Array) -> Array:
+        if not (values == np.rint(values)).all():
+            raise InputError(f"{self.path}: a list of corners holds numbers that are no integers; {AGAIN}")
+        return values.astype(np.int64)
 
     def _next(self, count: int) -> Array:
         out = self.numbers[self.at : self.at + count]

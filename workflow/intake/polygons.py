@@ -2,9 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
 import numpy as np
 
+from iif_core.errors import InputError
+
 Array = np.ndarray
+MOST_CORNERS, MOST_SQUARES = 10_000, 10**10
+"""Corners of one polygon, and the sum of their squares over all polygons, which ear clipping takes time for."""
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Put the file before what is wrong with its polygons."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def triangulated(vertices: Array, polygons: list[tuple[Array, Array]]) -> tuple[Array, Array]:
@@ -16,7 +33,16 @@ def triangulated(vertices: Array, polygons: list[tuple[Array, Array]]) -> tuple[
 
     Returns:
         (m, 3) int64 vertices, and (m,) int64 place of the polygon of each. Polygons of fewer than three corners are left out.
+
+    Raises:
+        InputError: a polygon has more corners than are allowed, or all have.
     """
+    most = max((corners.shape[1] for _, corners in polygons if len(corners)), default=0)
+    squares = sum(len(corners) * corners.shape[1] ** 2 for _, corners in polygons if corners.shape[1] > 4)
+    if most > MOST_CORNERS or squares > MOST_SQUARES:
+        raise InputError(
+            f"a polygon of {most} corners; allowed are {MOST_CORNERS}, fewer if there are many: triangulate the mesh"
+        )
     faces, places = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     for place, corners in polygons:
         k = corners.shape[1]
@@ -27,10 +53,12 @@ def triangulated(vertices: Array, polygons: list[tuple[Array, Array]]) -> tuple[
         elif k == 4:
             own = _of_quads(vertices, corners)
         else:
-            parts = [_clipped(vertices[one])[:, :] for one in corners]
-            faces += [one[part] for one, part in zip(corners, parts, strict=True)]
-            places += [np.full(len(part), at) for at, part in zip(place, parts, strict=True)]
-            continue
+            own, is_right = _of_fans(vertices, corners)
+            left = np.flatnonzero(~is_right)
+            parts = [corners[i][_clipped(vertices[corners[i]])] for i in left]
+            faces += parts
+            places += [np.full(len(part), place[i]) for i, part in zip(left, parts, strict=True)]
+            place, own = place[is_right], own[is_right]
         faces.append(own.reshape(-1, 3))
         places.append(np.repeat(place, own.shape[1]))
     joined, place = np.concatenate(faces), np.concatenate(places)
@@ -46,6 +74,17 @@ def _of_quads(vertices: Array, corners: Array) -> Array:
     normal = np.cross(at[..., 1, :] - at[..., 0, :], at[..., 2, :] - at[..., 0, :])
     alike = (normal[:, :, 0] * normal[:, :, 1]).sum(-1)
     return split[np.where((alike[0] >= 0) | ~(alike[1] > 0), 0, 1), np.arange(len(corners))]
+
+
+def _of_fans(vertices: Array, corners: Array) -> tuple[Array, Array]:
+    """(p, k - 2, 3) triangles of polygons (p, k) around their first corner, and for which polygons (p,) none is turned over."""
+    k = corners.shape[1]
+    fan = np.stack([np.zeros(k - 2, np.int64), np.arange(1, k - 1), np.arange(2, k)], 1)
+    at = vertices[corners]
+    spokes = at - at[:, :1]
+    normal = np.cross(spokes[:, 1:-1], spokes[:, 2:])
+    along = (normal * normal.sum(1, keepdims=True)).sum(-1)
+    return corners[:, fan], (along >= 0).all(1) & (along > 0).any(1)
 
 
 def _clipped(corners: Array) -> Array:

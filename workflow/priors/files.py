@@ -92,7 +92,7 @@ def load(path: Path, width: int, height: int, srgb: bool) -> np.ndarray:
     Raises:
         InputError: another aspect ratio, or values outside [0, 1].
     """
-    photo = images.load_photo(path)
+    photo = images.load_photo(path, colour="srgb")  # the setting says how it is encoded, and no profile
     stored_height, stored_width = photo.valid.shape
     if abs(stored_width * height / (stored_height * width) - 1) > ASPECT_TOLERANCE:
         raise InputError(

@@ -13,7 +13,7 @@ sys.path.insert(0, CHECKOUT)
 from snakemake.cli import get_argument_parser
 
 from iif_core.errors import InputError
-from workflow.artifacts import kept, links, sound
+from workflow.artifacts import links, sound
 from workflow.batch import causes
 from workflow.batch import plan as batch_table
 from workflow.comparison import named as comparison

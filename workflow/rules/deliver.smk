@@ -7,7 +7,7 @@ rule publish:
         unpack(publish_inputs),
     output:
         scene=report(
-            directory("scenes/{scene}"),
+            update(directory("scenes/{scene}")),  # what people put there is carried over
             patterns=["{page}.html"],
             caption="../report/captions/scene.rst",
             category="Scenes",

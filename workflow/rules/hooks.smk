@@ -35,26 +35,12 @@ def tell_costs_of_dry_run():
 atexit.register(tell_costs_of_dry_run)
 
 
-def keep_own_files():
-    """Set apart what people put into deliverables that are made anew: Snakemake removes the folders. What an earlier run left apart
-    comes back."""
-    if not workflow.is_main_process:
-        return
-    made = {job.wildcards.scene for job in workflow.dag.needrun_jobs(exclude_finished=False) if job.rule.name == "publish"}
-    for scene in made:
-        kept.set_apart(Path("scenes") / scene)
-    put_back_own_files(made)
-    atexit.register(put_back_own_files)  # an interrupted run does so too
-
-
-def put_back_own_files(but=()):
-    """Put back what was set apart, of all scenes `but` these."""
-    if not workflow.is_main_process:
-        return
-    for place in Path("scenes").glob(".*.own"):
-        scene = place.name[1 : -len(".own")]
-        if scene not in but:
-            kept.put_back(Path("scenes") / scene)
+def forget_backups():
+    """Remove copies of deliverables that Snakemake has made before a job that was killed: it fails where one is there. Publishing
+    leaves a whole folder at every moment, so they are not needed."""
+    for job in workflow.dag.needrun_jobs(exclude_finished=False):
+        if workflow.is_main_process and job.rule.name == "publish":
+            workflow.persistence.cleanup_backup(Path("scenes") / job.wildcards.scene)
 
 
 def tell_reasons():

@@ -277,13 +277,13 @@ def _listed_ids(lists: list[Path]) -> dict[Path, list[np.ndarray]]:
     return out
 
 
-def load_ids(listed: dict[Path, list[np.ndarray]], path: Path, turn: int = 1) -> np.ndarray:
+def load_ids(listed: dict[Path, list[np.ndarray]], path: Path, turn: int = 1, size: tuple[int, int] | None = None) -> np.ndarray:
     """Read object ids (H, W) int32 from the first channel of an EXR, -1 = none.
 
     There is no id where the value is negative, not finite or between integers (anti-aliased edges,
     docs/method/numerics.md#ids-between-integers), nor where object_ids.txt does not list it for this photograph (blends).
     """
-    values = images.load_map(path, 1)
+    values = images.load_map(path, 1, size)
     known = np.isfinite(values)
     whole = np.rint(np.where(known, values, -1))
     known &= (np.abs(np.where(known, values, 0) - whole) <= 1e-3) & (whole >= 0)

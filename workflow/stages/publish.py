@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
-from workflow.artifacts import kept, stamps
 from workflow.artifacts import manifest as manifests
+from workflow.artifacts import stamps
 from workflow.artifacts.files import copy, flush_folders, inside, make_folder, named, sha256_of, write_parquet
 from workflow.artifacts.manifest import MANIFEST, SCENE_SCHEMA
 from workflow.artifacts.store import StageReader
@@ -34,14 +34,16 @@ def run(job: Job) -> None:
     readers = {stage: job.read(stage) for stage in job.stage.upstream}
     writer = job.writer  # from here on, the stage is not finished
     facts = {"scene": job.scene, "quality": job.quality, "fingerprint": job.fingerprint, "settings": job.document}
-    published, size = deliver(readers, facts, read_timings(job.scene))
-    if own := kept.put_back(Path("scenes") / job.scene):
+    published, size, own = deliver(readers, facts, read_timings(job.scene))
+    if own:
         job.log.info("scenes/%s: kept %d files that were put there: %s", job.scene, len(own), ", ".join(own[:5]))
     writer.json("published.json", published)
     job.log.info("scenes/%s: %d files, %.1f MB", job.scene, len(published["files"]), size / 1e6)
 
 
-def deliver(readers: dict[str, StageReader], facts: dict[str, Any], timings: list[dict[str, Any]]) -> tuple[dict[str, Any], int]:
+def deliver(
+    readers: dict[str, StageReader], facts: dict[str, Any], timings: list[dict[str, Any]]
+) -> tuple[dict[str, Any], int, list[str]]:
     """Build `scenes/.<scene>.tmp` and rename it to `scenes/<scene>`, so the folder is complete, old or new, or absent.
 
     Args:
@@ -50,7 +52,7 @@ def deliver(readers: dict[str, StageReader], facts: dict[str, Any], timings: lis
         timings: of the jobs (`read_timings`), for timings.parquet.
 
     Returns:
-        The hashes of its files and of its manifest, and how many bytes the files have.
+        The hashes of its files and of its manifest, how many bytes the files have, and the names of what the user has put there.
     """
     target = Path("scenes") / facts["scene"]
     temporary = target.with_name(f".{target.name}.tmp")
@@ -59,9 +61,7 @@ def deliver(readers: dict[str, StageReader], facts: dict[str, Any], timings: lis
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         files, seen = _build(readers, facts, timings, temporary)
-        if target.is_dir():  # run by hand; otherwise Snakemake has removed it
-            kept.set_apart(target)
-        replace(temporary, target)
+        own = replace(temporary, target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     hashes = {name: file["sha256"] for name, file in files.items()}
@@ -70,7 +70,7 @@ def deliver(readers: dict[str, StageReader], facts: dict[str, Any], timings: lis
     for name, stamp in seen.items():
         noted.note(target / name, stamp, hashes.get(name, digest))
     noted.save(stamps.place(Path("results"), target.name, stamps.DELIVERABLE), flushed=True)
-    return {"files": hashes, "manifest_sha256": digest}, sum(file["bytes"] for file in files.values())
+    return {"files": hashes, "manifest_sha256": digest}, sum(file["bytes"] for file in files.values()), own
 
 
 def _build(

@@ -205,7 +205,10 @@ def explain(
         Advice as text; empty if no convention fits.
     """
     chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, TRIAL_VIEWS).astype(int))]
-    depths = [images.load_depth(frame.depth, depth_unit) if frame.depth else None for frame, _ in chosen]
+    depths = [
+        images.load_depth(frame.depth, depth_unit, (frame.camera.width, frame.camera.height)) if frame.depth else None
+        for frame, _ in chosen
+    ]
     some = [replace(f, seen=f.seen[:: max(1, len(f.seen) // TRIAL_POINTS)]) if f.seen is not None else f for f, _ in chosen]
     chosen = [(frame, view) for frame, (_, view) in zip(some, chosen, strict=True)]
 
@@ -403,7 +406,7 @@ class Alignment:
             unit: metres per value of the depth image; None = by its format.
         """
         if frame.depth is not None:
-            measured = images.load_depth(frame.depth, unit)
+            measured = images.load_depth(frame.depth, unit, (frame.camera.width, frame.camera.height))
             self.ratios[frame.name] = depth_ratio(frame, conventions, view, mesh_depth, measured)
         elif frame.seen is not None and len(frame.seen) >= MIN_POINTS:
             self.what = "sparse points"

@@ -55,6 +55,13 @@ def _number(path: Path, document: dict[str, Any], key: str) -> float:
     return float(value)
 
 
+def _object(path: Path, what: str) -> dict[str, Any]:
+    document = read_json(path, what)
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: found a {type(document).__name__}; {what} is an object: export the raw data again")
+    return document
+
+
 def _array(path: Path, key: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     with reading(path, f"`{key}` holds no {' x '.join(map(str, shape))} numbers", "; export the raw data again"):
         return np.array(values, np.float64).reshape(shape)
@@ -74,13 +81,15 @@ def _polycam(folder: Path) -> _Found:
     files = sorted((frames / cameras).glob("*.json"))
     info, read = folder / "mesh_info.json", list(files)
     if info.is_file():
-        turned = read_json(info, "what Polycam says of its mesh").get("alignmentTransform")
+        turned = _object(info, "what Polycam says of its mesh").get("alignmentTransform")
         read.append(info)
         # Stored column by column.
         world = None if turned is None else _array(info, "alignmentTransform", turned, (4, 4)).T
+        if world is not None and (fault := transforms.fault_of_similarity(world)):
+            raise InputError(f"{info}: `alignmentTransform` {fault}; export the raw data again")
     entries = []
     for file in files:
-        document, name = read_json(file, "a camera of Polycam"), file.stem
+        document, name = _object(file, "a camera of Polycam"), file.stem
         image = next((p for s in images.EXTENSIONS if (p := frames / photographs / f"{name}{s}").is_file()), None)
         if image is None:
             continue
@@ -114,7 +123,7 @@ def _record3d(folder: Path) -> _Found:
     pictures of w x h."""
     path = _metadata(folder)
     assert path is not None
-    document = read_json(path, "the metadata of Record3D")
+    document = _object(path, "the metadata of Record3D")
     poses = _array(path, "poses", document.get("poses"), (-1, 7))
     given = document.get("perFrameIntrinsicCoeffs")
     if given:
@@ -158,7 +167,7 @@ def _scanner(folder: Path) -> _Found:
     millimetres."""
     entries, files = [], sorted(folder.glob("frame_*.json"))
     for file, image in _pairs(files):
-        document = read_json(file, "a frame of 3D Scanner App")
+        document = _object(file, "a frame of 3D Scanner App")
         matrix = _array(file, "cameraPoseARFrame", document.get("cameraPoseARFrame"), (4, 4))
         k = _array(file, "intrinsics", document.get("intrinsics"), (3, 3))
         width, height = images.header(image).size

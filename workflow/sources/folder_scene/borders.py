@@ -1,7 +1,7 @@
 """Black borders: what a program that removed the distortion of a lens without cropping, or a letterbox, leaves without a picture.
 
-Read as surface they would be black walls. They are known by being black, connected to the edge, and in the same place in most
-photographs; dark surface moves with the camera.
+Read as surface they would be black walls. They are known by being black, connected to the edge, in the same place in most
+photographs, and lit in none; dark surface moves with the camera.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from workflow.sources.folder_scene.transforms import Frame, evenly_spread
 
 BLACK, MEDIAN = 16 / 255, 2 / 255
 """Largest sensor value of a border, as JPEG leaves it, and of the median of its pixels."""
+BRIGHT = 40 / 255
+"""Sensor value that no pixel of a border has in any photograph."""
 MOST, FEWEST, MOST_READ = 0.8, 3, 12
 """Share of the photographs of a size in which a pixel is of the border; fewest from which that is known; most that are read."""
 LEAST, LARGEST = 1e-3, 0.9
@@ -41,14 +43,16 @@ def find_borders(frames: Sequence[Frame], encoded: bool, read: Callable[[Frame],
         if len(chosen) < FEWEST:
             continue
         count, shown = np.zeros(size[::-1], np.uint8), 0
+        is_lit = np.zeros(size[::-1], bool)
         for frame in chosen:
             photo = read(frame)
             border = black_border(photo.pixels, photo.valid, encoded)
             if border.mean() < LARGEST:  # a black photograph says nothing
                 count, shown = count + border, shown + 1
+                is_lit |= photo.valid & (photo.pixels.max(-1) > (BRIGHT if encoded else 0.0))
             if shown - int(count.max()) > (1 - MOST) * len(chosen):  # no pixel can be in enough of them any more
                 break
-        border = count >= max(MOST * shown, FEWEST)
+        border = (count >= max(MOST * shown, FEWEST)) & ~is_lit
         if border.mean() >= LEAST:
             is_jpeg = any(frame.image.suffix.lower() in (".jpg", ".jpeg") for frame in chosen)
             found[size] = _widened(border, JPEG_RIM if is_jpeg else RIM)

@@ -14,7 +14,7 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.intake.documents import reading
-from workflow.intake.pictures import exr_chromaticities, exr_windows, opened
+from workflow.intake.pictures import ExrWindows, exr_chromaticities, exr_windows, opened
 from workflow.sources.folder_scene.profiles import SPACES, Space, converted, linear_conversion, of_16_bits
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr")
@@ -48,13 +48,18 @@ class Stated(NamedTuple):
 
 @dataclass(frozen=True)
 class Header:
-    """Size (width, height) as stored, of an EXR that of its display window, EXIF orientation 1 ... 8 (1 = upright), the exposure
-    that EXIF states, and the size of the data window of an EXR."""
+    """Size (width, height) as stored, EXIF orientation 1 ... 8 (1 = upright), the exposure that EXIF states, and the size of the
+    display window of an EXR that holds other pixels than those."""
 
     size: tuple[int, int]
     orientation: int = 1
     stated: Stated | None = None
-    data: tuple[int, int] | None = None
+    display: tuple[int, int] | None = None
+
+    @property
+    def shown(self) -> tuple[int, int]:
+        """Size of the picture that the file shows."""
+        return self.display or self.size
 
 
 @dataclass
@@ -83,7 +88,7 @@ class Photo:
 def _header(path: Path, _stamp: tuple[int, int]) -> Header:
     if path.suffix.lower() == ".exr":
         windows = exr_windows(path)
-        return Header(windows.display, data=windows.data)
+        return Header(windows.data, display=None if windows.is_plain else windows.display)
     with reading(path, "not a readable image"):
         with opened(path) as image:
             if image.mode not in MODES:
@@ -181,9 +186,9 @@ def _pixels_of(path: Path, colour: str | None) -> tuple[np.ndarray, str, Space |
             return np.asarray(image), f"in {name}" if name else "", space
 
 
-def _exr(path: Path, whole: bool = False) -> dict[str, np.ndarray]:
-    """Read the channels of an EXR in its display window; where it holds no pixels they are NaN, or the largest integer. With
-    `whole` all pixels that it holds, wherever they are shown."""
+def _exr(path: Path, size: tuple[int, int] | None = None) -> dict[str, np.ndarray]:
+    """Read the channels of an EXR: the picture in its display window if that has the given size, otherwise all pixels that it
+    holds. Where the display window lacks pixels, channels are NaN, or the largest integer (`_held`)."""
     from workflow.artifacts.files import read_exr
 
     windows = exr_windows(path)
@@ -192,25 +197,24 @@ def _exr(path: Path, whole: bool = False) -> dict[str, np.ndarray]:
         channels = read_exr(path)
         if any(values.shape != (height, width) for values in channels.values()):
             raise InputError(f"{path}: channels of different sizes (subsampled?); write all of them at full size")
-        if whole or (windows.data == windows.display and windows.place == (0, 0)):
+        if windows.is_plain or size != windows.display:
             return channels
-        shown = windows.display[0], windows.display[1]
-        columns, rows = slice(max(x, 0), max(min(x + width, shown[0]), 0)), slice(max(y, 0), max(min(y + height, shown[1]), 0))
+        rows, columns = _held(windows)
         out = {}
         for name, values in channels.items():
             none = np.nan if values.dtype.kind == "f" else np.iinfo(values.dtype).max
-            out[name] = np.full(shown[::-1], none, values.dtype)
+            out[name] = np.full(windows.display[::-1], none, values.dtype)
             out[name][rows, columns] = values[rows.start - y : rows.stop - y, columns.start - x : columns.stop - x]
         return out
 
 
-def _not_held(path: Path) -> int:
-    """Return the number of pixels of the display window of an EXR that it does not hold."""
-    windows = exr_windows(path)
-    held = 1
+def _held(windows: ExrWindows) -> tuple[slice, slice]:
+    """Rows and columns of the display window that the file holds."""
+    spans = []
     for size, shown, at in zip(windows.data, windows.display, windows.place, strict=True):
-        held *= max(min(at + size, shown) - max(at, 0), 0)
-    return windows.display[0] * windows.display[1] - held
+        first = min(max(at, 0), shown)
+        spans.append(slice(first, max(min(at + size, shown), first)))
+    return spans[1], spans[0]
 
 
 def _colours(path: Path, channels: dict[str, np.ndarray]) -> list[str]:
@@ -230,18 +234,19 @@ def _exr_colour(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
     return np.stack([channels[name].astype(np.float32) for name in _colours(path, channels)], -1)
 
 
-def load_photo(path: Path, turn: int = 1, whole: bool = False, colour: str = "file") -> Photo:
-    """Read a photograph: 8 or 16 bits become [0, 1], EXR values stay, grey becomes RGB. Of an EXR the display window is read, or
-    with `whole` the data window.
+def load_photo(path: Path, turn: int = 1, size: tuple[int, int] | None = None, colour: str = "file") -> Photo:
+    """Read a photograph: 8 or 16 bits become [0, 1], EXR values stay, grey becomes RGB. Of an EXR the display window is read
+    if it has the given size (width, height), otherwise the data window.
 
     Colours of another space, by the profile, the chunks or the EXIF of the file, or the primaries of an EXR, are converted to
     sRGB; a `colour` other than `file` is the space whatever the file says (`source.colour`).
     Pixels with alpha < 0.5 and those that are NaN or infinite are not valid and become 0. EXR stores colour multiplied by alpha,
     so it is divided by alpha. Negative EXR values become 0.
     """
-    form, outside = "", 0
+    form, held = "", None
     if path.suffix.lower() == ".exr":
-        found, outside = _exr(path, whole), 0 if whole else _not_held(path)
+        found, windows = _exr(path, size), exr_windows(path)
+        held = None if windows.is_plain or size != windows.display else _held(windows)
         names = _colours(path, found)
         height, width = found[names[0]].shape
         stated = SPACES[colour].primaries if colour in SPACES else None
@@ -251,6 +256,8 @@ def load_photo(path: Path, turn: int = 1, whole: bool = False, colour: str = "fi
 
         def strip(rows: slice) -> tuple[np.ndarray, np.ndarray | None]:
             values = np.stack([found[name][rows].astype(np.float32) for name in names], -1)
+            if held is not None:
+                values[~_within(held, slice(rows.start, rows.start + len(values)), width)] = np.nan
             if to_rec709 is not None:
                 values[..., :3] = values[..., :3] @ to_rec709.T
             if len(names) < 4:
@@ -263,7 +270,9 @@ def load_photo(path: Path, turn: int = 1, whole: bool = False, colour: str = "fi
         if stored.ndim != 3 or stored.dtype.kind not in "iu":
             raise InputError(f"{path}: pixels of type {stored.dtype}, shape {stored.shape}; expected 8 or 16 bits")
         height, width, channels = stored.shape
-        space = space if channels >= 3 else None
+        if space is not None and channels < 3:
+            space = space.grey()
+            name = name if space is not None else ""
         form = " ".join(["16-bit"] * (stored.dtype.itemsize > 1) + ["grey"] * (channels < 3) + [name] * bool(name))
 
         def strip(rows: slice) -> tuple[np.ndarray, np.ndarray | None]:
@@ -283,9 +292,19 @@ def load_photo(path: Path, turn: int = 1, whole: bool = False, colour: str = "fi
         photo.non_finite += int((~finite).sum())
         photo.transparent += int((finite & ~opaque).sum())
         photo.negative += int((values.min(-1) < 0).sum())
-    photo.non_finite, photo.outside = photo.non_finite - outside, outside  # what an EXR does not hold was read as NaN
+    if held is not None:  # what an EXR does not hold was read as NaN
+        photo.outside = height * width - int(_within(held, slice(0, height), width).sum())
+        photo.non_finite -= photo.outside
     photo.pixels, photo.valid = TURNS[turn](photo.pixels), TURNS[turn](photo.valid)
     return photo
+
+
+def _within(held: tuple[slice, slice], rows: slice, width: int) -> np.ndarray:
+    """(rows, width) bool, the pixels of some rows that lie within `held` rows and columns."""
+    own = np.arange(rows.start, rows.stop)
+    return ((own >= held[0].start) & (own < held[0].stop))[:, None] & (
+        (np.arange(width) >= held[1].start) & (np.arange(width) < held[1].stop)
+    )
 
 
 def load_mask(path: Path, turn: int = 1, full: bool = False) -> np.ndarray:
@@ -300,9 +319,10 @@ def load_mask(path: Path, turn: int = 1, full: bool = False) -> np.ndarray:
     return TURNS[turn](kept)
 
 
-def load_map(path: Path, channels: int) -> np.ndarray:
-    """Read an EXR map, (H, W, 3) or (H, W) float32; values that are not finite are kept for the caller to mask."""
-    values = _exr_colour(path, found) if "R" in (found := _exr(path)) else _one_channel(path, found)[..., None]
+def load_map(path: Path, channels: int, size: tuple[int, int] | None = None) -> np.ndarray:
+    """Read an EXR map, (H, W, 3) or (H, W) float32; values that are not finite are kept for the caller to mask. `size`: as in
+    `load_photo`."""
+    values = _exr_colour(path, found) if "R" in (found := _exr(path, size)) else _one_channel(path, found)[..., None]
     if channels == 3:
         return np.repeat(values, 3, -1) if values.shape[-1] == 1 else values[..., :3]
     return values[..., 0]
@@ -314,7 +334,7 @@ def _one_channel(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
     return next(iter(channels.values()))
 
 
-def load_ids(path: Path, turn: int = 1) -> np.ndarray:
+def load_ids(path: Path, turn: int = 1, size: tuple[int, int] | None = None) -> np.ndarray:
     """Read object ids (H, W) int32 from a one-channel png (8 or 16 bit) or EXR, -1 = none.
 
     Files mark pixels without an id by a negative number or NaN (float EXR), 4294967295 (UINT EXR) or 65535 (16-bit png). 0 is an
@@ -324,7 +344,7 @@ def load_ids(path: Path, turn: int = 1) -> np.ndarray:
         InputError: a colour picture, or ids between integers (docs/method/numerics.md#ids-between-integers).
     """
     if path.suffix.lower() == ".exr":
-        stored = _one_channel(path, _exr(path))
+        stored = _one_channel(path, _exr(path, size))
     else:
         header(path)
         with reading(path, "cannot be read", "; the file is damaged or cut short"), opened(path) as image:
@@ -350,10 +370,10 @@ def load_ids(path: Path, turn: int = 1) -> np.ndarray:
     return TURNS[turn](ids.astype(np.int32))
 
 
-def load_depth(path: Path, unit: float | None) -> np.ndarray:
+def load_depth(path: Path, unit: float | None, size: tuple[int, int] | None = None) -> np.ndarray:
     """Read z-depth (H, W) float32 in metres, 0 = unknown; `unit` is metres per value, by default 0.001 (png) or 1 (EXR)."""
     if path.suffix.lower() == ".exr":
-        found = _exr(path)
+        found = _exr(path, size)
         named = next((found[name] for name in ("Z", "depth.Z", "Y", "R") if name in found), None)
         depth = (_one_channel(path, found) if named is None else named).astype(np.float32)
         scale = 1.0 if unit is None else unit

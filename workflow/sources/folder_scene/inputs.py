@@ -27,7 +27,7 @@ class Inputs:
         exposures: exposures.json.
         metres: per unit of the poses and of the mesh.
         of_vertices: reads the object ids of the mesh's vertices.
-        load_ids: reads a map of object ids, given its path and the EXIF turn.
+        load_ids: reads a map of object ids, given its path, the EXIF turn and the size of the picture.
         response: (3, 101) true camera response.
         also: further files that are read.
     """
@@ -37,7 +37,7 @@ class Inputs:
     exposures: Path | None = None
     metres: float = 1.0
     of_vertices: Callable[[], mesh.VertexIds] | None = None
-    load_ids: Callable[[Path, int], np.ndarray] = images.load_ids
+    load_ids: Callable[[Path, int, tuple[int, int]], np.ndarray] = images.load_ids
     response: np.ndarray | None = None
     also: tuple[Path, ...] = ()
 

@@ -129,6 +129,8 @@ def _lens(path: Path, where: str, sensor: ElementTree.Element | None, camera: El
     with reading(path, f"{where}: its calibration holds no numbers", "; export the cameras again"):
         width, height = int(size.get("width", "")), int(size.get("height", ""))
         own = {child.tag: float(child.text or "nan") for child in adjusted[0] if child.tag in _NUMBERS}
+    if not np.isfinite(list(own.values())).all() or not own.get("f", 0.0) > 0:
+        raise InputError(f"{path}: {where}: its calibration has no focal length `f`, or empty numbers; export the cameras again")
     extra = [name for name in ("k4", "p3", "p4") if own.get(name)]
     if extra or abs(own.get("b2", 0.0)) > _MOST_SKEW:
         raise InputError(

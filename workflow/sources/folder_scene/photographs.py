@@ -61,13 +61,18 @@ def view_of(
     return View(view_id, frame.name, *intrinsics, pose, exposure, split)
 
 
+def size_of(frame: Frame) -> tuple[int, int]:
+    """Return width and height of the picture to which the camera belongs: of an EXR that tells its windows apart."""
+    return frame.camera.width, frame.camera.height
+
+
 def decoded(frame: Frame) -> images.Photo:
     """Read a photograph as its file has it.
 
     Raises:
         InputError: it cannot be read, or is not of the size that its header says.
     """
-    photo = images.load_photo(frame.image, frame.turn, frame.whole, frame.colour)
+    photo = images.load_photo(frame.image, frame.turn, size_of(frame), frame.colour)
     _upright(frame, frame.image, photo.pixels)
     return photo
 
@@ -96,9 +101,9 @@ def photograph(frame: Frame, view: View, encoded: bool, gain: float, border: np.
     return Photograph(pixels if encoded else pixels / np.float32(gain), valid, counts, photo.form)
 
 
-def object_ids(frame: Frame, view: View, load: Callable[[Path, int], np.ndarray]) -> np.ndarray:
+def object_ids(frame: Frame, view: View, load: Callable[[Path, int, tuple[int, int]], np.ndarray]) -> np.ndarray:
     """Read the map of object ids of a frame that has one, (H, W) int32, -1 = none."""
-    ids = _upright(frame, frame.ids, load(frame.ids, frame.turn))
+    ids = _upright(frame, frame.ids, load(frame.ids, frame.turn, size_of(frame)))
     if not frame.lens.is_identity:
         moved, seen = undistort_image(ids, frame.lens, frame.camera, _target(frame), nearest=True)
         ids = np.where(seen, moved, -1)
@@ -110,7 +115,7 @@ def truth(frame: Frame, view: View, taken: Photograph, encoded: bool, face: np.n
     maps, known = {}, np.ones(face.shape, bool)
     for kind, path in frame.truth.items():
         channels = 1 if kind in ("roughness", "metallic") else 3
-        values = images.TURNS[frame.turn](images.load_map(path, channels))
+        values = images.TURNS[frame.turn](images.load_map(path, channels, size_of(frame)))
         values = _upright(frame, path, values.reshape(*values.shape[:2], channels))
         finite = np.isfinite(values).all(-1)
         values, covered = _resized(frame, view, np.where(finite[..., None], values, 0), finite)

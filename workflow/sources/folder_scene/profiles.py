@@ -60,6 +60,10 @@ class Space(NamedTuple):
         light = light if self.matrix is None else light @ self.matrix.T
         return srgb_from_linear(np.clip(light, 0.0, 1.0)).astype(np.float32)
 
+    def grey(self) -> Space | None:
+        """The space of its grey values; None where that is sRGB."""
+        return None if self.light is linear_from_srgb else self._replace(primaries=_REC709)
+
 
 SPACES = {
     "srgb": Space("sRGB", _REC709, linear_from_srgb),
@@ -73,7 +77,7 @@ SPACES = {
 
 
 def converted(image: Any, path: Path) -> tuple[Any, str, Space | None]:
-    """Convert an RGB or RGBA picture of Pillow, 8 bits a channel, to sRGB by its ICC profile.
+    """Convert a picture of Pillow, 8 bits a channel, to sRGB by its ICC profile; grey has none that counts.
 
     Colours outside of sRGB are cut off at its border. The curve of the profile is replaced by the sRGB curve, as in a program
     that shows the picture; the response of the camera is estimated afterwards.
@@ -85,11 +89,12 @@ def converted(image: Any, path: Path) -> tuple[Any, str, Space | None]:
     Raises:
         InputError: the profile is none, or what the file says of its colours cannot be read.
     """
+    space, is_told = stated_space(image, path)
     if image.mode not in ("RGB", "RGBA"):
-        return image, "", None
-    space = stated_space(image, path)
+        space = None if space is None else space.grey()
+        return image, "" if space is None else space.name, space
     profile = image.info.get("icc_profile")
-    if space is not None or not profile:
+    if is_told or not profile:
         return image, "" if space is None else space.name, space
     from PIL import ImageCms
 
@@ -98,24 +103,25 @@ def converted(image: Any, path: Path) -> tuple[Any, str, Space | None]:
 
 
 def of_16_bits(image: Any, path: Path) -> Space | None:
-    """Return the colour space of an RGB or RGBA picture of 16 bits where it is another than sRGB.
+    """Return the colour space of a picture of 16 bits where it is another than sRGB.
 
     Raises:
         InputError: it is stated by an ICC profile, by which 8 bits alone can be converted, or cannot be read.
     """
+    space, is_told = stated_space(image, path)
     if image.mode not in ("RGB", "RGBA"):
-        return None
-    space = stated_space(image, path)
+        return None if space is None else space.grey()
     profile = image.info.get("icc_profile")
-    if space is None and profile:
+    if not is_told and profile:
         name, transform = _conversion(profile, "RGB", path)
         if transform is not None:
             raise InputError(f"{path}: 16 bits in {name}; allowed: sRGB. Convert it to sRGB, or save it with 8 bits")
     return space
 
 
-def stated_space(image: Any, path: Path) -> Space | None:
-    """Return the colour space that a picture states without an ICC profile, None where that is sRGB, or nothing is stated.
+def stated_space(image: Any, path: Path) -> tuple[Space | None, bool]:
+    """Return the colour space that a picture states without an ICC profile, None where that is sRGB, or nothing is stated; and
+    whether a profile would not count beside it.
 
     A PNG states it by its chunks cICP, or without a profile and sRGB by gAMA and cHRM (PNG 3rd edition, 11.3.2); a JPEG of a
     camera by the interoperability index R03 of EXIF, which is Adobe RGB (DCF 2.0).
@@ -125,10 +131,10 @@ def stated_space(image: Any, path: Path) -> Space | None:
     """
     coded = png_chunk(path, b"cICP")
     if coded is not None:
-        return _by_code_points(path, coded)
+        return _by_code_points(path, coded), True
     info = image.info
     if info.get("icc_profile") or "srgb" in info:
-        return None
+        return None, False
     gamma, white_first = info.get("gamma"), info.get("chromaticity")
     if gamma is not None or white_first is not None:
         usual = gamma is None or not 0.05 < gamma < 20 or abs(gamma - 1 / 2.2) <= SAME_GAMMA
@@ -139,12 +145,12 @@ def stated_space(image: Any, path: Path) -> Space | None:
             points = tuple(map(tuple, (*points, white)))
         space = Space(f"the colours that its chunks state (gamma {gamma or 1 / 2.2:.3g})", points, light)
         try:
-            return None if usual and space.matrix is None else space
+            return (None if usual and space.matrix is None else space), False
         except InputError as error:
             raise InputError(f"{path}: chunk cHRM: {error}; save the photograph again in sRGB") from None
     exif = image.getexif()
     index = exif.get_ifd(0xA005).get(1) if 0x8769 in exif else None
-    return SPACES["adobe_rgb"] if str(index).startswith("R03") else None
+    return (SPACES["adobe_rgb"] if str(index).startswith("R03") else None), False
 
 
 _CODED_PRIMARIES = {1: _REC709, 2: _REC709, 9: _REC2020, 12: _P3}

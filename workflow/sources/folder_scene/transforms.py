@@ -47,6 +47,8 @@ CONVERTERS = {
 """What to do with photographs of other formats."""
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 RIGID_TOLERANCE = 5e-3  # largest entry of R^T R - I: rounding to three decimals passes, a scale of 1 % does not
+SAME_SHAPE = 0.03
+"""Difference of the ratio of sides by which a depth image is still one of the same camera."""
 MIN_OFFSET_IF_SWAPPED = 0.08
 """Offset of the principal point from the middle, as a share of the picture, above which x and y may have been swapped."""
 
@@ -98,7 +100,6 @@ class Frame:
         exposure: factor on radiance before the response, where the source itself knows it.
         ids: map of object ids.
         truth: kind -> map of true materials, emission or radiance.
-        whole: the picture is the data window of an EXR, and not its display window.
         colour: space of its colours, `file` = as the file says (`source.colour`).
     """
 
@@ -119,7 +120,6 @@ class Frame:
     exposure: float | None = None
     ids: Path | None = None
     truth: dict[str, Path] = field(default_factory=dict)
-    whole: bool = False
     colour: str = "file"
 
     def files(self) -> list[Path]:
@@ -249,7 +249,10 @@ def frames_of(
     Raises:
         InputError: at the first fault.
     """
-    every = _matching(path, _told_apart(entries), source.get("frames"))
+    for entry in entries:
+        if fault := fault_of_path(entry.file_path):
+            raise InputError(f"{path}: {shown(entry.file_path)} {fault}")
+    every = _told_apart(_matching(path, entries, source.get("frames")))
     found = {id(entry): _find_image(path, root, entry) for entry in every}
     raw = choose_entries(every, capture["views"])
     if all(entry.split == "test" for entry in raw):
@@ -265,10 +268,12 @@ def frames_of(
     _same_sizes(path, document, located, headers)
     _refuse_bad_poses(path, raw)
     strict = source["alignment"] != "off"
-    frames = [_frame(path, document, entry, image, headers[image], offset, strict) for entry, image in located]
+    frames = [_frame(path, root, document, entry, image, headers[image], offset, strict) for entry, image in located]
     absent = [f.depth for f in frames if f.depth is not None and not f.depth.is_file()]
     if absent:
         raise InputError(f"{path}: {_some(absent)} named by `depth_file_path`: not found; add them or remove the key")
+    for frame in frames:
+        _same_shape(frame)
     absent = [f.mask for f in frames if f.mask is not None and not f.mask.is_file()]
     if absent:
         raise InputError(
@@ -282,6 +287,20 @@ def frames_of(
     if world is not None:
         frames = [replace(f, matrix=_in_world(world, f.matrix)) for f in frames]
     return Transforms(path, tuple(frames), _depth_unit(path, document), source.get("axes", "opengl"))
+
+
+def _same_shape(frame: Frame) -> None:
+    """Refuse a depth image without a camera of its own whose sides have another ratio than those of the photograph."""
+    if frame.depth is None or frame.depth_camera is not None or frame.turn != 1:
+        return
+    size = images.header(frame.depth)
+    own = (frame.camera.width, frame.camera.height)
+    width, height = own if own in (size.size, size.shown) else size.size
+    if abs(width * own[1] / (height * own[0]) - 1) > SAME_SHAPE:
+        raise InputError(
+            f"{frame.depth}: {width}x{height}, its photograph has {own[0]}x{own[1]}: another shape, so another camera; give"
+            " `depth_intrinsics` (docs/guide/own-data.md), or remove `depth_file_path`"
+        )
 
 
 def _in_world(world: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -308,13 +327,23 @@ def _applied(path: Path, document: dict[str, Any]) -> np.ndarray:
         )
     matrix = np.eye(4)
     matrix[: len(rows)] = rows
-    turn = matrix[:3, :3]
-    if np.linalg.det(turn) <= 0 or np.abs(turn.T @ turn / np.cbrt(np.linalg.det(turn)) ** 2 - np.eye(3)).max() > RIGID_TOLERANCE:
-        raise InputError(f"{path}: `applied_transform` is no rotation with one scale (determinant {np.linalg.det(turn):.4g})")
+    if fault := fault_of_similarity(matrix):
+        raise InputError(f"{path}: `applied_transform` {fault}")
     scale = _number(path, "top level", document, "applied_scale", 1.0)
     if not scale > 0:
         raise InputError(f"{path}: `applied_scale` is {scale:g}; must be positive")
     return np.linalg.inv(matrix) @ np.diag([1 / scale, 1 / scale, 1 / scale, 1.0])
+
+
+def fault_of_similarity(matrix: np.ndarray) -> str:
+    """Return why a matrix (4, 4) is no rotation and translation with one scale, or an empty text if it is."""
+    if not np.isfinite(matrix).all():
+        return "holds NaN or infinity"
+    turn = matrix[:3, :3]
+    size = float(np.linalg.det(turn))
+    if size <= 0 or np.abs(turn.T @ turn / np.cbrt(size) ** 2 - np.eye(3)).max() > RIGID_TOLERANCE:
+        return f"is no rotation with one scale (determinant {size:.4g})"
+    return "" if np.abs(matrix[3] - [0, 0, 0, 1]).max() < 1e-6 else f"has the last row {matrix[3].tolist()}"
 
 
 def _listed_splits(path: Path, document: dict[str, Any], entries: list[Entry]) -> list[Entry]:
@@ -545,7 +574,8 @@ def _same_sizes(
             header = headers[image]
             stated = (document.get("w"), document.get("h"))
             turned = header.orientation >= 5 and stated == header.size[::-1]
-            sizes.setdefault(stated if turned else header.size, []).append(image)
+            shown = header.size if stated == header.size else header.shown
+            sizes.setdefault(stated if turned else shown, []).append(image)
     if len(sizes) > 1:
         rows = sorted(sizes.items(), key=lambda item: -len(item[1]))
         text = "; ".join(f"{w}x{h}: {len(found)} image(s) such as {found[0].name}" for (w, h), found in rows[:4])
@@ -568,6 +598,7 @@ def _number(path: Path, where: str, values: dict[str, Any], key: str, default: f
 
 def _frame(
     path: Path,
+    root: Path,
     document: dict[str, Any],
     entry: Entry,
     image: Path,
@@ -578,13 +609,12 @@ def _frame(
     where = entry.where
     values = {key: value for key, value in document.items() if key != "frames"} | entry.keys
     width, height, turn = _size(path, where, values, image, header)
-    whole = (width, height) == header.data != header.size
     camera = _camera(path, where, values, width, height, offset, strict="w" not in values)
     if strict:
         _not_swapped(path, where, camera)
     depth, depth_camera, depth_matrix = None, None, None
     if entry.keys.get("depth_file_path"):
-        depth = existing(path.parent / str(entry.keys["depth_file_path"]))
+        depth = existing(root / str(entry.keys["depth_file_path"]))
         if isinstance(values.get("depth_intrinsics"), dict):
             own = values["depth_intrinsics"]
             size = images.header(depth).size if depth.is_file() else (width, height)
@@ -606,13 +636,12 @@ def _frame(
         entry.mask_full,
         entry.split,
         entry.seen,
-        whole=whole,
     )
 
 
 def _size(path: Path, where: str, values: dict[str, Any], image: Path, header: images.Header) -> tuple[int, int, int]:
     """Return width and height of the picture that the intrinsics describe, and the EXIF turn that produces it."""
-    stored = header.size
+    stored = header.shown
     width, height = (_number(path, where, values, key, size) for key, size in zip("wh", stored, strict=True))
     stated = (int(round(width)), int(round(height)))
     turned = stored[::-1] if header.orientation >= 5 else stored
@@ -626,7 +655,7 @@ def _size(path: Path, where: str, values: dict[str, Any], image: Path, header: i
                 " cameras belong to the turned picture; save the images upright (orientation 1) and repeat the pose"
                 " estimation, or remove the EXIF tag if the poses were made from the stored pixels"
             )
-    if stated == header.data:  # of an EXR with overscan, or a crop, whose cameras belong to all its pixels
+    if stated == header.size:  # of an EXR with overscan, or a crop, whose cameras belong to all its pixels
         return *stated, 1
     if stated != stored:
         factor = stored[0] / stated[0] if stated[0] else 0
