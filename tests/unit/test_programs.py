@@ -8,6 +8,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from iif_core.camera.distortion import Distortion
+from iif_core.errors import InputError
 from tests.errors import refused
 from tests.unit import own_scene as own
 from workflow.sources.folder_scene import inputs
@@ -371,3 +372,43 @@ def test_a_folder_of_no_known_program_is_refused_with_the_page(tmp_path, shots):
     own.save_mesh(path / "mesh.ply", *own.room_mesh()[:2])
     with refused("transforms.json", "COLMAP", "docs/guide/programs.md"):
         own.run(tmp_path, "capture")
+
+
+def message(run, *arguments):
+    with pytest.raises(InputError) as caught:
+        run(*arguments)
+    return str(caught.value)
+
+
+def test_cameras_under_another_name_and_in_a_folder_below_are_pointed_out(tmp_path, shots):
+    path = metashape(tmp_path, shots)
+    (path / "cameras.xml").rename(path / "my cameras.xml")
+    assert "Found my cameras.xml: name it with `source.cameras`" in message(own.run, tmp_path, "capture")
+    own.project(tmp_path, source=PROJECT | {"cameras": "my camera.xml"})
+    said = message(own.run, tmp_path, "capture")
+    assert "not found" in said and "my cameras.xml" in said and "COLMAP" not in said
+    own.project(tmp_path, source=PROJECT | {"cameras": "my cameras.xml"})
+    agrees(tmp_path, shots, np.eye(4))
+    below = tmp_path / "data/more"
+    below.mkdir()
+    path.rename(below / "scan")
+    (below / "scan/my cameras.xml").rename(below / "scan/cameras.xml")
+    below.rename(path)
+    own.project(tmp_path, source=PROJECT)
+    assert "own/scan: set `source.path` to it" in message(own.run, tmp_path, "capture")
+
+
+def test_photographs_in_another_folder_are_pointed_out(tmp_path, shots):
+    path = metashape(tmp_path, shots)
+    (path / "images").rename(path / "photos")
+    assert "set `source.images: photos`" in message(own.run, tmp_path, "capture")
+    own.project(tmp_path, source=PROJECT | {"images": "photo"})
+    assert "Did you mean data/own/photos?" in message(own.run, tmp_path, "capture")
+    own.project(tmp_path, source=PROJECT | {"images": "photos"})
+    agrees(tmp_path, shots, np.eye(4))
+
+
+def test_the_mesh_of_the_app_is_named_where_there_is_none(tmp_path, shots):
+    path, _ = polycam(tmp_path, shots)
+    (path / "raw.glb").unlink()
+    assert "raw.glb" in message(own.run, tmp_path, "capture")

@@ -110,8 +110,24 @@ def _cameras(
         return apps.frames_of(app, folder, source, capture), apps.MESHES[app]
     raise InputError(
         f"{folder}: neither transforms.json nor a COLMAP model, nor cameras of another program that is known"
-        f" (docs/guide/programs.md); a `folder` scene needs one of them.{did_you_mean_path(folder / 'transforms.json')}"
+        f" (docs/guide/programs.md); a `folder` scene needs one of them.{_hint(folder)}"
     )
+
+
+def _hint(folder: Path) -> str:
+    """Say which file may be meant, or that the capture lies one folder further down, as archives are often unpacked."""
+    found = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in photogrammetry.SUFFIXES)
+    if found:
+        return f" Found {', '.join(found[:3])}: name it with `source.cameras`"
+    for below in sorted(path for path in folder.iterdir() if path.is_dir()):
+        if (
+            (below / "transforms.json").is_file()
+            or apps.find(below)
+            or photogrammetry.find(below, None)
+            or colmap.find(below, None)
+        ):
+            return f" There is one in {below}: set `source.path` to it"
+    return did_you_mean_path(folder / "transforms.json")
 
 
 def _instances(folder: Path, frames: tuple[Frame, ...]) -> dict[str, Path]:

@@ -113,7 +113,9 @@ def find(folder: Path, name: str | None, others: Sequence[str] = ()) -> Path:
     if not found:
         meshes = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
         hint = f" Found {', '.join(meshes[:3])}: name it with `source.mesh`." if meshes else ""
-        raise InputError(f"{folder}: no {', '.join(NAMES)}; a mesh of the scene is needed (docs/guide/own-data.md).{hint}")
+        raise InputError(
+            f"{folder}: no {', '.join((*others, *NAMES))}; a mesh of the scene is needed (docs/guide/own-data.md).{hint}"
+        )
     _refuse_empty(found[0])
     check_mesh(found[0])
     return found[0]

@@ -14,11 +14,15 @@ from iif_core.errors import InputError
 from workflow.intake import limits
 from workflow.intake.documents import read_json, read_text, reading
 from workflow.intake.names import existing, forward, shown
+from workflow.settings.names import did_you_mean_path
 from workflow.sources.folder_scene import transforms
 from workflow.sources.folder_scene.transforms import Entry, Transforms
 
+SUFFIXES = (".xml", ".sfm")
 NAMES = ("cameras.xml", "cameras.sfm", "sfm.json")
 """Names under which cameras are looked for if none is stated."""
+DEFAULT_IMAGES = "images"
+"""`source.images` if it is not given; then photographs may also lie beside the cameras."""
 _MOST_SKEW = 0.5
 """Pixels of skew (b2 of Metashape) that do not count."""
 _UNDISTORT = "export undistorted photographs with their cameras"
@@ -28,7 +32,13 @@ def find(folder: Path, stated: str | None) -> Path | None:
     """Return the file of the cameras: `source.cameras` if it is such a file, or the first of `NAMES`; None = there is none."""
     if stated is not None:
         path = existing(folder / stated)
-        return path if path.is_file() and path.suffix.lower() in (".xml", ".sfm") or path.name == "sfm.json" else None
+        if path.suffix.lower() not in SUFFIXES and path.name != "sfm.json":
+            return None
+        if not path.is_file():
+            raise InputError(
+                f"{path}: not found (`source.cameras: {stated}`, which counts from `source.path`).{did_you_mean_path(path)}"
+            )
+        return path
     return next((folder / name for name in NAMES if (folder / name).is_file()), None)
 
 
@@ -42,7 +52,9 @@ def frames_of(folder: Path, path: Path, source: dict[str, Any], capture: dict[st
     entries, without, world = (_metashape if program == "Metashape" else _meshroom)(path)
     if not entries:
         raise InputError(f"{path}: none of its photographs has a pose; align them, and export the cameras again")
-    root = folder / source["images"]
+    root = existing(folder / source["images"])
+    if not root.is_dir() and source["images"] != DEFAULT_IMAGES:
+        raise InputError(f"{root}: not found (`source.images`).{did_you_mean_path(root)}")
     root = root if root.is_dir() else folder
     listed = transforms.frames_of(path, {}, entries, root, source, capture, world)
     notes = [f"cameras: {program}"]

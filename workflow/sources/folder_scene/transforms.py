@@ -519,11 +519,22 @@ def _some(paths: list[Any], shown: int = 3) -> str:
 
 def _all_present(path: Path, root: Path, missing: list[Path]) -> None:
     if missing:
-        start = "the folder of transforms.json" if path.parent == root else str(root)
+        start = f"the folder of {path.name}" if path.parent == root else str(root)
         raise InputError(
-            f"{path}: {len(missing)} image(s) not found: {_some(missing)}. `file_path` counts from {start},"
-            f" with extension ({', '.join(images.EXTENSIONS)}) or without"
+            f"{path}: {len(missing)} image(s) not found: {_some(missing)}."
+            f" {'`file_path` counts' if path.suffix == '.json' else 'Names count'} from {start},"
+            f" with extension ({', '.join(images.EXTENSIONS)}) or without.{_elsewhere(path, missing[0])}"
         )
+
+
+def _elsewhere(path: Path, missing: Path) -> str:
+    """Say in which folder beside the cameras a missing photograph lies, if it does."""
+    wanted = same_name(missing.stem)
+    for folder in sorted(own for own in path.parent.iterdir() if own.is_dir()):
+        if any(same_name(file.stem) == wanted and file.suffix.lower() in images.EXTENSIONS for file in folder.iterdir()):
+            cure = "write it before the names" if path.suffix == ".json" else f"set `source.images: {folder.name}`"
+            return f" There is one in {folder.name}/: {cure}"
+    return ""
 
 
 def _one_range(path: Path, files: list[Path], dynamic_range: str) -> None:
