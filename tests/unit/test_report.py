@@ -421,12 +421,16 @@ def test_damage_is_named(toy, tmp_path):
     assert [line.split(":")[0].rsplit("/", 1)[1] for line in damaged(copy)] == ["plan.yaml"]
 
 
-def test_publishing_again_replaces(toy, monkeypatch):
-    monkeypatch.chdir(toy)
-    (toy / "scenes/toy/stray.txt").write_text("left by a user")
-    publish.run(scene_of(toy).job("publish"))
-    assert not (toy / "scenes/toy/stray.txt").exists()
-    assert not list((toy / "scenes").glob(".*"))
+def test_publishing_again_replaces_what_is_its_own(toy, tmp_path, monkeypatch):
+    place = tmp_path / "toy"
+    shutil.copytree(toy, place)
+    monkeypatch.chdir(place)
+    (place / "scenes/toy/room.blend").write_text("of a user")
+    (place / "scenes/toy/report.html").write_text("edited")
+    publish.run(scene_of(place).job("publish"))
+    assert (place / "scenes/toy/room.blend").read_text() == "of a user"
+    assert (place / "scenes/toy/report.html").read_bytes() == (toy / "scenes/toy/report.html").read_bytes()
+    assert not list((place / "scenes").glob(".*"))
 
 
 def test_failed_publication_leaves_the_old_one(toy, monkeypatch):
