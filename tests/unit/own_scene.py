@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -119,6 +120,18 @@ def save_mesh(path, vertices, faces, instance=None):
     tail = [""] * len(faces) if instance is None else [f" {i}" for i in instance]
     lines += [f"3 {a} {b} {c}{t}" for (a, b, c), t in zip(faces, tail, strict=True)]
     Path(path).write_text("\n".join(lines) + "\n")
+
+
+def rewrite_glb(path, change):
+    """Let `change` change the JSON of a GLB in place."""
+    data = path.read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    document = json.loads(data[20 : 20 + size])
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + size :]
+    path.write_bytes(struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest)
 
 
 def frame(i, pose, folder="images", suffix=".png"):

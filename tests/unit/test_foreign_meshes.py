@@ -395,18 +395,8 @@ def test_sparse_positions(tmp_path):
     arrays = [(corners, False, 0), (np.array([1, 2, 3], np.uint16), False, 0), (moved, False, 0)]
     arrays.append((np.array([0, 1, 2, 0, 2, 3], np.uint16), False, 0))
     path = glb(tmp_path / "a.glb", [[{"attributes": {"POSITION": 0}, "indices": 3}]], [{"mesh": 0}], arrays)
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    document = json.loads(data[20 : 20 + size])
-    document["accessors"][0]["sparse"] = {
-        "count": 3,
-        "indices": {"bufferView": 1, "componentType": 5123},
-        "values": {"bufferView": 2},
-    }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + size :]
-    path.write_bytes(struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest)
+    sparse = {"count": 3, "indices": {"bufferView": 1, "componentType": 5123}, "values": {"bufferView": 2}}
+    own.rewrite_glb(path, lambda document: document["accessors"][0].update(sparse=sparse))
     found = mesh.load(path, 1.0)
     assert 0.5 * np.linalg.norm(areas(found.vertices, found.faces), axis=1).sum() == pytest.approx(1.0)
 
@@ -442,29 +432,17 @@ def test_a_scan_that_draco_has_made_small_is_decoded(tmp_path):
             accessor["count"] = count
         del document["accessors"][2]
 
-    rewritten(path, without_buffers)
+    own.rewrite_glb(path, without_buffers)
     assert path.stat().st_size < faces.size
     found = mesh.load(path, 1.0)
     assert len(found.faces) == len(faces)
     np.testing.assert_allclose(found.bounds, [points.min(0), points.max(0)], atol=4e-3)
 
 
-def rewritten(path, change):
-    """Change the JSON of a GLB."""
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    document = json.loads(data[20 : 20 + size])
-    change(document)
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + size :]
-    path.write_bytes(struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest)
-
-
 def test_buffers_without_a_file_are_refused(tmp_path):
     corners = np.eye(3, dtype=np.float32)
     path = glb(tmp_path / "a.glb", [[{"attributes": {"POSITION": 0}}]], [{"mesh": 0}], [(corners, False, 0)])
-    rewritten(path, lambda document: document.update(buffers=[{"byteLength": 36}] * 100))
+    own.rewrite_glb(path, lambda document: document.update(buffers=[{"byteLength": 36}] * 100))
     with refused("a.glb", "buffer 1"):
         mesh.load(path, 1.0)
 
@@ -506,14 +484,7 @@ def test_a_plain_file_stays_as_it_is(tmp_path):
 def test_accessors_that_do_not_fit_are_refused(tmp_path, change):
     corners = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], np.int16)
     path = glb(tmp_path / "a.glb", [[{"attributes": {"POSITION": 0}}]], [{"mesh": 0}], [(corners, True, 8)])
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    document = json.loads(data[20 : 20 + size])
-    document["accessors"][0] |= change
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + size :]
-    path.write_bytes(struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest)
+    own.rewrite_glb(path, lambda document: document["accessors"][0].update(change))
     with refused("a.glb"):
         mesh.load(path, 1.0)
 

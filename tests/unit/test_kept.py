@@ -94,6 +94,18 @@ def test_names_that_are_taken_are_counted(tmp_path):
     assert (target / "extra.own2.usda").read_text() == "mine extra.usda"
 
 
+@pytest.mark.parametrize(("mine", "new"), [("extra/a.txt", "extra"), ("extra", "extra/a.txt"), ("a/extra/b.txt", "a/extra")])
+def test_a_folder_and_a_file_of_one_name_both_stay(tmp_path, mine, new):
+    old, target = tmp_path / "old", tmp_path / "room"
+    published(old)
+    (old / mine).parent.mkdir(parents=True, exist_ok=True)
+    (old / mine).write_text("mine")
+    published(target, names=[*WRITTEN, new])
+    assert kept.carry(old, target) == [mine.replace("extra", "extra.own")]
+    assert (target / mine.replace("extra", "extra.own")).read_text() == "mine"
+    assert (target / new).read_text() == f"{new} 0"
+
+
 def test_what_snakemake_leaves_is_not_the_users(tmp_path):
     published(tmp_path / "old")
     published(tmp_path / "room")

@@ -6,6 +6,8 @@ Names that a manifest lists are the workflow's own; everything else belongs to t
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 from iif_core.errors import InputError
@@ -30,7 +32,7 @@ def carry(old: Path, target: Path) -> list[str]:
     for name in _names(old):
         if name in listed:
             continue
-        place = _free(target / name)
+        place = _free(target, name)
         place.parent.mkdir(parents=True, exist_ok=True)
         os.rename(old / name, place)
         flush_folder(place.parent)
@@ -49,12 +51,20 @@ def _recorded(target: Path) -> set[str]:
     return set(facts_in(Path("results") / target.name / "publish" / "published.json").get("files", {}))
 
 
-def _free(place: Path) -> Path:
-    """A path where nothing is."""
-    if not os.path.lexists(place):
-        return place
-    others = (place.with_name(f"{place.stem}.own{number or ''}{place.suffix}") for number in (0, *range(2, 10**6)))
-    return next(other for other in others if not os.path.lexists(other))
+def _free(target: Path, name: str) -> Path:
+    """A path below `target` where nothing is: the name, with `.own` in each part of it that something else has taken."""
+    *folders, last = Path(name).parts
+    place = target
+    for folder in folders:
+        place = next(path for path in _alternatives(place / folder) if path.is_dir() or not os.path.lexists(path))
+    return next(path for path in _alternatives(place / last) if not os.path.lexists(path))
+
+
+def _alternatives(path: Path) -> Iterator[Path]:
+    """`scene.glb`, `scene.own.glb`, `scene.own2.glb` and so on."""
+    yield path
+    for number in count(1):
+        yield path.with_name(f"{path.stem}.own{number if number > 1 else ''}{path.suffix}")
 
 
 def _names(folder: Path) -> list[str]:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iif_core.errors import InputError
-from iif_core.numerics.color import linear_from_srgb, rec709_from_primaries, srgb_from_linear
+from iif_core.numerics.color import REC709_PRIMARIES, linear_from_srgb, rec709_from_primaries, srgb_from_linear
 from workflow.intake.pictures import png_chunk
 
 SAME_LEVELS = 2
@@ -23,8 +23,7 @@ SAME_PRIMARIES = 0.01
 LARGEST_PROFILE = 4 << 20  # bytes; those of cameras and phones have less than 10,000
 SAME_GAMMA = 0.03
 """How far the gAMA of a PNG may be from 1 / 2.2, which stands for sRGB."""
-_D65 = (0.3127, 0.329)
-_REC709 = ((0.64, 0.33), (0.3, 0.6), (0.15, 0.06), _D65)
+_D65 = REC709_PRIMARIES[3]
 _P3 = ((0.68, 0.32), (0.265, 0.69), (0.15, 0.06), _D65)
 _REC2020 = ((0.708, 0.292), (0.17, 0.797), (0.131, 0.046), _D65)
 _ADOBE = ((0.64, 0.33), (0.21, 0.71), (0.15, 0.06), _D65)
@@ -62,12 +61,12 @@ class Space(NamedTuple):
 
     def grey(self) -> Space | None:
         """The space of its grey values; None where that is sRGB."""
-        return None if self.light is linear_from_srgb else self._replace(primaries=_REC709)
+        return None if self.light is linear_from_srgb else self._replace(primaries=REC709_PRIMARIES)
 
 
 SPACES = {
-    "srgb": Space("sRGB", _REC709, linear_from_srgb),
-    "linear": Space("linear Rec. 709", _REC709, None),
+    "srgb": Space("sRGB", REC709_PRIMARIES, linear_from_srgb),
+    "linear": Space("linear Rec. 709", REC709_PRIMARIES, None),
     "display_p3": Space("Display P3", _P3, linear_from_srgb),
     "adobe_rgb": Space("Adobe RGB", _ADOBE, _power(_ADOBE_GAMMA)),
     "rec2020": Space("Rec. 2020", _REC2020, _from_video),
@@ -139,7 +138,7 @@ def stated_space(image: Any, path: Path) -> tuple[Space | None, bool]:
     if gamma is not None or white_first is not None:
         usual = gamma is None or not 0.05 < gamma < 20 or abs(gamma - 1 / 2.2) <= SAME_GAMMA
         light = linear_from_srgb if usual else None if abs(gamma - 1.0) <= SAME_GAMMA else _power(1.0 / gamma)
-        points = _REC709
+        points = REC709_PRIMARIES
         if white_first is not None:
             white, *points = np.reshape(np.asarray(white_first, np.float64), (4, 2)).tolist()
             points = tuple(map(tuple, (*points, white)))
@@ -153,7 +152,7 @@ def stated_space(image: Any, path: Path) -> tuple[Space | None, bool]:
     return (SPACES["adobe_rgb"] if str(index).startswith("R03") else None), False
 
 
-_CODED_PRIMARIES = {1: _REC709, 2: _REC709, 9: _REC2020, 12: _P3}
+_CODED_PRIMARIES = {1: REC709_PRIMARIES, 2: REC709_PRIMARIES, 9: _REC2020, 12: _P3}
 _CODED_CURVES = {
     **dict.fromkeys((2, 13), linear_from_srgb),
     **dict.fromkeys((1, 6, 14, 15), _from_video),
