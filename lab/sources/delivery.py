@@ -227,8 +227,8 @@ def _registered(job: Job, writer: RenderedWriter, rendered: Rendered, room: Room
     from lab.simulated.realism import POSE_ERROR, focal_factor, misplaced, stream
     from workflow.sources.folder import MIN_COVERAGE
     from workflow.sources.folder_scene import images, registration
+    from workflow.sources.folder_scene.frames import Frame
     from workflow.sources.folder_scene.photographs import pinhole, view_of
-    from workflow.sources.folder_scene.transforms import Frame
 
     factor, frames, photos = focal_factor(stream(job.seed, "focal")), [], []
     for number, view in enumerate(out.views):

@@ -22,8 +22,8 @@ from lab.sources.rendered import RenderedWriter
 from workflow.intake.meshes import check_mesh
 from workflow.intake.pictures import check_texture
 from workflow.scene.normal_form import Truth, View
+from workflow.sources.folder_scene.camera import metres_per_unit
 from workflow.sources.folder_scene.mesh import check_across
-from workflow.sources.folder_scene.transforms import metres_per_unit
 
 if TYPE_CHECKING:
     from lab.simulated.scanned import Scanned

@@ -72,14 +72,14 @@ def found(source: dict[str, Any], points: bool = False, **capture: Any) -> None:
     if finder is None:
         from workflow.sources.folder_scene.inputs import find_inputs as finder
     inputs = finder(tree["source"], tree["capture"], **more)
-    written([frame.name for frame in inputs.transforms.frames])
-    for frame in inputs.transforms.frames[:2]:
+    written([frame.name for frame in inputs.cameras.frames])
+    for frame in inputs.cameras.frames[:2]:
         assert np.isfinite(frame.matrix).all() and np.isfinite([frame.camera.fx, frame.camera.cx]).all()
         images.load_photo(frame.image, frame.turn)
         if frame.mask:
             images.load_mask(frame.mask, frame.turn, frame.mask_full)
         if frame.depth:
-            images.load_depth(frame.depth, inputs.transforms.depth_unit)
+            images.load_depth(frame.depth, inputs.cameras.depth_unit)
         for path in (frame.truth or {}).values():
             images.load_map(path, 3)
         if frame.ids:
@@ -88,7 +88,7 @@ def found(source: dict[str, Any], points: bool = False, **capture: Any) -> None:
     if inputs.exposures:
         from workflow.sources.folder_scene import exposure
 
-        exposure.read_given(inputs.exposures, [(f.name, f.file_path) for f in inputs.transforms.frames])
+        exposure.read_given(inputs.exposures, [(f.name, f.file_path) for f in inputs.cameras.frames])
 
 
 def load_mesh(path: Path, metres: float = 1.0, of_vertices: Any = None, tree: Any = None, inputs: Any = None) -> None:
@@ -97,8 +97,8 @@ def load_mesh(path: Path, metres: float = 1.0, of_vertices: Any = None, tree: An
     found = mesh.load(path, metres, of_vertices)
     assert np.isfinite(found.vertices).all() and len(found.faces) and found.faces.max() < len(found.vertices)
     if inputs is not None:
-        conventions = alignment.Conventions(inputs.transforms.axes, metres)
-        centres = np.array([conventions.pose(frame)[:3, 3] for frame in inputs.transforms.frames])
+        conventions = alignment.Conventions(inputs.cameras.axes, metres)
+        centres = np.array([conventions.pose(frame)[:3, 3] for frame in inputs.cameras.frames])
         mesh.check_size(path, found, tree["source"].get("unit", "m"), metres, centres)
 
 

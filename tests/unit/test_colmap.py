@@ -11,7 +11,8 @@ from iif_core.errors import InputError
 from tests.errors import named
 from tests.unit import own_scene as own
 from tests.unit import scannetpp_scene as mini
-from workflow.sources.folder_scene import colmap, transforms
+from workflow.sources.folder_scene import colmap
+from workflow.sources.folder_scene.camera import opencv_pose
 from workflow.sources.folder_scene.inputs import find_inputs
 
 CAPTURE = {"width": 320, "height": 320}
@@ -38,7 +39,7 @@ def scene(path, room, views, subfolder=""):
 
 def listed(path, capture=None, points=False, **source):
     document = own.settings_of(path, source, {**CAPTURE, **(capture or {})})
-    return find_inputs(document["source"], document["capture"], points).transforms
+    return find_inputs(document["source"], document["capture"], points).cameras
 
 
 def refused(path, **keys):
@@ -290,7 +291,7 @@ def test_applied_scale_moves_cameras_without_stretching_them(room, views, tmp_pa
         entry["transform_matrix"] = matrix.tolist()
     own.write_transforms(tmp_path, document | {"applied_scale": 0.25})
     for frame, (pose, _) in zip(listed(tmp_path, applied_transform="undo").frames, views, strict=False):
-        np.testing.assert_allclose(transforms.opencv_pose(frame.matrix, "opengl", 1.0), pose, atol=1e-12)
+        np.testing.assert_allclose(opencv_pose(frame.matrix, "opengl", 1.0), pose, atol=1e-12)
 
 
 def test_cameras_may_be_another_json(room, views, tmp_path):

@@ -152,8 +152,8 @@ def test_synthetic_photographs_exposures_and_response(tmp_path):
 def test_fewer_views_keep_their_own_exposures(tmp_path):
     synthetic(tmp_path)
     found = fipt.find_inputs(*(document(tmp_path, "ldr", {"views": 3})[key] for key in ("source", "capture")))
-    names = [f.name for f in found.transforms.frames]
-    assert names == ["000_0001", "002_0001", "val_001_0001"] and [frame.exposure for frame in found.transforms.frames] == [
+    names = [f.name for f in found.cameras.frames]
+    assert names == ["000_0001", "002_0001", "val_001_0001"] and [frame.exposure for frame in found.cameras.frames] == [
         0.5,
         2.0,
         0.25,
@@ -184,8 +184,8 @@ def test_truth_is_all_or_none(tmp_path):
     named(refused(tmp_path), "val/Metallic/001_0001.exr", 1)
     (tmp_path / "val/BaseCol").rename(tmp_path / "val/DiffCol")
     found = fipt.find_inputs(*(document(tmp_path)[key] for key in ("source", "capture")))
-    assert not any(frame.truth for frame in found.transforms.frames) and any(
-        "no ground truth: BaseCol missing" in note for note in found.transforms.notes
+    assert not any(frame.truth for frame in found.cameras.frames) and any(
+        "no ground truth: BaseCol missing" in note for note in found.cameras.notes
     )
 
 

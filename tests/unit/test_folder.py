@@ -22,6 +22,8 @@ from workflow.scene.normal_form import View, stated_exposures, widest
 from workflow.settings.source import FolderSource
 from workflow.sources import folder
 from workflow.sources.folder_scene import alignment, images, mesh, transforms
+from workflow.sources.folder_scene.camera import opencv_pose
+from workflow.sources.folder_scene.entries import evenly_spread
 
 
 def read(path, source=None, capture=None):
@@ -37,8 +39,8 @@ def test_opengl_poses_become_opencv(tmp_path):
     own.bare(tmp_path)
     frames = read(tmp_path).frames
     for frame, pose in zip(frames, own.poses(3), strict=True):
-        np.testing.assert_allclose(transforms.opencv_pose(frame.matrix, "opengl", 1.0), pose, atol=1e-12)
-        in_mm = transforms.opencv_pose(frame.matrix, "opengl", 0.001)
+        np.testing.assert_allclose(opencv_pose(frame.matrix, "opengl", 1.0), pose, atol=1e-12)
+        in_mm = opencv_pose(frame.matrix, "opengl", 0.001)
         np.testing.assert_allclose(in_mm[:3, 3], pose[:3, 3] * 0.001)
         np.testing.assert_allclose(in_mm[:3, :3], pose[:3, :3], atol=1e-12)
     assert [f.name for f in frames] == ["000", "001", "002"]
@@ -83,7 +85,7 @@ def test_paths_without_extension_globs_and_spread(tmp_path):
     own.write_transforms(tmp_path, document)
     assert [f.name for f in read(tmp_path, capture={"views": 4}).frames] == ["001", "003", "005", "007"]
     assert [f.name for f in read(tmp_path, {"frames": "images/00[0-2]"}).frames] == ["000", "001", "002"]
-    assert transforms.evenly_spread(3, 5) == [0, 1, 2] and transforms.evenly_spread(100, 1) == [50]
+    assert evenly_spread(3, 5) == [0, 1, 2] and evenly_spread(100, 1) == [50]
     got = folder.raw_inputs(own.settings_of(tmp_path, capture={"views": 4}))
     assert [p.name for p in got] == [
         "transforms.json",

@@ -12,8 +12,9 @@ from scipy.ndimage import uniform_filter
 
 from iif_core.camera.distortion import Distortion, Pinhole
 from tests.unit.painted_room import FOCAL, HEIGHT, WIDTH, look, posed, room, twisted
+from workflow.sources.folder_scene.camera import opencv_pose
+from workflow.sources.folder_scene.frames import Frame
 from workflow.sources.folder_scene.registration import register_frames
-from workflow.sources.folder_scene.transforms import Frame, opencv_pose
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -262,7 +262,7 @@ def test_the_lens_of_metashape_has_its_tangential_numbers_the_other_way(tmp_path
     """x' = x (1 + k1 r^2 + ...) + p1 (r^2 + 2 x^2) + 2 p2 x y, by its manual; OpenCV has p2 where Metashape has p1."""
     path = metashape(tmp_path, shots, lens={"k1": -0.08, "k2": 0.02, "p1": -5e-4, "p2": 1e-3})
     source = {"path": str(path), "cameras": None, "unit": "m", "mesh": None, "alignment": "check", "images": "images"}
-    (frame, *_) = inputs.find_inputs(source, {"views": 9, "dynamic_range": "ldr", "test_every": 0}).transforms.frames
+    (frame, *_) = inputs.find_inputs(source, {"views": 9, "dynamic_range": "ldr", "test_every": 0}).cameras.frames
     assert frame.lens == LENS
     assert (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy) == (60, 62, 33, 23)
 
@@ -359,7 +359,7 @@ def test_a_focal_length_in_millimetres(tmp_path, shots):
     document["intrinsics"][0] |= {"focalLength": "33.75", "sensorWidth": "36.0", "sensorHeight": "27.0"}
     (path / "cameras.sfm").write_text(json.dumps(document))
     source = {"path": str(path), "cameras": None, "unit": "m", "mesh": None, "alignment": "check", "images": "images"}
-    (frame, *_) = inputs.find_inputs(source, {"views": 9, "dynamic_range": "ldr", "test_every": 0}).transforms.frames
+    (frame, *_) = inputs.find_inputs(source, {"views": 9, "dynamic_range": "ldr", "test_every": 0}).cameras.frames
     assert (frame.camera.fx, frame.camera.fy) == (60, 60)
 
 

@@ -230,7 +230,7 @@ def test_a_scene_without_annotation_needs_another_segmentation(copy, gone):
     assert not any("segments" in path.name for path in scannetpp.raw_inputs(document))
     found = scannetpp.find_inputs(document["source"], document["capture"])
     assert found.of_vertices is None
-    assert f"no {' and '.join(gone)}: the scene comes without object ids" in found.transforms.notes
+    assert f"no {' and '.join(gone)}: the scene comes without object ids" in found.cameras.notes
 
 
 def test_other_refusals(copy, tmp_path):
@@ -254,7 +254,7 @@ def test_lists_without_pose_and_hidden_tests(copy, tmp_path):
     (copy / "dslr/resized_images/DSC00005.JPG").unlink()
     tree = {"source": {"kind": "scannetpp", "path": str(copy)}, "prior": {"kind": "retinex"}}
     document = settings.dump(settings.SceneSettings.model_validate(tree))
-    both = scannetpp.find_inputs(document["source"], document["capture"]).transforms
+    both = scannetpp.find_inputs(document["source"], document["capture"]).cameras
     assert [f.name for f in both.frames] == ["DSC00000", "DSC00001", "DSC00002", "DSC00003"]
     assert any("1 listed photographs have no pose" in note and "DSC09999" in note for note in both.notes)
     assert any("1 test photographs are not in resized_images/" in note for note in both.notes)

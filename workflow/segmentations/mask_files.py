@@ -112,10 +112,10 @@ def mask_files(own: dict[str, Any], source: dict[str, Any], capture: dict[str, A
     photographs: dict[str, Photograph] = {}
     if source["kind"] in PHOTOGRAPHED:
         find_inputs = importlib.import_module(plugins.implementation("source", source["kind"])).find_inputs
-        known = find_inputs(source, {**capture, "views": 1_000_000_000}).transforms.frames
+        known = find_inputs(source, {**capture, "views": 1_000_000_000}).cameras.frames
         photographs = {frame.name: Photograph(frame.camera, frame.lens, frame.turn) for frame in known}
         _refuse_unknown(folder, {*maps, *binary}, set(photographs))
-        used = {frame.name for frame in find_inputs(source, capture).transforms.frames}
+        used = {frame.name for frame in find_inputs(source, capture).cameras.frames}
         maps = {name: path for name, path in maps.items() if name in used}
         binary = {name: paths for name, paths in binary.items() if name in used}
         if not maps and not binary:

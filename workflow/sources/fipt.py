@@ -22,8 +22,10 @@ from workflow.intake.documents import read_text
 from workflow.runtime.job import Job
 from workflow.sources import folder
 from workflow.sources.folder_scene import images, mesh, transforms
+from workflow.sources.folder_scene.camera import metres_per_unit
+from workflow.sources.folder_scene.entries import Entry
+from workflow.sources.folder_scene.frames import checked_frames, folder_at
 from workflow.sources.folder_scene.inputs import Inputs
-from workflow.sources.folder_scene.transforms import Entry
 
 OPENCV_FROM_LEFT_UP_FORWARD = np.diag([-1.0, -1.0, 1.0, 1.0])  # from the camera axes of the synthetic scenes
 MAX_COSINE_TO_UP = 2e-3  # between viewing direction and up vector of a real camera
@@ -78,7 +80,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any]) -> Inputs:
     Raises:
         InputError: missing or inconsistent files, by name.
     """
-    home = transforms.folder_at(source, "scene.obj")
+    home = folder_at(source, "scene.obj")
     encoded = settings["dynamic_range"] == "ldr"
     if (home / "train/transforms.json").is_file():
         found = _synthetic(home, source, encoded)
@@ -89,7 +91,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any]) -> Inputs:
             f"{home}: neither train/transforms.json (synthetic) nor cam.txt and K_list.txt (real); `source.path` is the folder"
             " of one FIPT scene"
         )
-    listed = transforms.frames_of(found.path, {}, found.entries, home, source, settings)
+    listed = checked_frames(found.path, {}, found.entries, home, source, settings)
     at = {frame.name: found.at[frame.name] for frame in listed.frames}
     exposures, response, cam = _sensor(found, at) if encoded else ({}, None, [])
     truth = _truth(found, at)
@@ -102,7 +104,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any]) -> Inputs:
     return Inputs(
         listed,
         mesh.find(home, source["mesh"]),
-        metres=transforms.metres_per_unit(source["unit"]),
+        metres=metres_per_unit(source["unit"]),
         load_ids=partial(load_ids, _listed_ids(lists)),
         response=response,
         also=(*cam, *lists),

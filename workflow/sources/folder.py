@@ -32,12 +32,12 @@ from workflow.sources.folder_scene import (
     notes,
     photographs,
     registration,
-    transforms,
 )
+from workflow.sources.folder_scene.entries import evenly_spread
+from workflow.sources.folder_scene.frames import Frame
 from workflow.sources.folder_scene.inputs import Inputs, find_inputs
 from workflow.sources.folder_scene.photographs import Photograph, decoded, photograph, pinhole, view_of
 from workflow.sources.folder_scene.room import Room
-from workflow.sources.folder_scene.transforms import Frame
 
 MIN_COVERAGE = 0.01  # share of the rays of a view that must hit the mesh
 
@@ -63,16 +63,16 @@ def capture(job: Job) -> None:
 def capture_photographs(job: Job, inputs: Inputs) -> None:
     """Write the normal form of photographs with known cameras and a mesh, whichever source found them."""
     source, settings = job.settings.source, job.settings.capture
-    conventions = alignment.Conventions(inputs.transforms.axes, inputs.metres, mesh_axes=mesh_axes(source.mesh_up))
+    conventions = alignment.Conventions(inputs.cameras.axes, inputs.metres, mesh_axes=mesh_axes(source.mesh_up))
     surface = _mesh(inputs, source)
     origin = surface.origin
     inputs, surface = inputs.from_origin(origin), surface.from_origin(origin)
-    frames = inputs.transforms.frames
+    frames = inputs.cameras.frames
     poses = [conventions.pose(frame) for frame in frames]
     centres = np.array([pose[:3, 3] for pose in poses])
     mesh.check_size(inputs.mesh, surface, getattr(source, "unit", "m"), inputs.metres, centres)
     surface = surface.closed(source.close_holes)
-    said = [*inputs.transforms.notes, *surface.notes, *notes.of_origin(origin)]
+    said = [*inputs.cameras.notes, *surface.notes, *notes.of_origin(origin)]
     exposures, words = exposure.given(inputs.exposures, frames, settings.exposure)
     said += words
     task = _Task(inputs, source, settings, conventions, Room.of(surface, job.threads))
@@ -92,7 +92,7 @@ def capture_photographs(job: Job, inputs: Inputs) -> None:
         raise InputError(_sees_nothing(task, taken))
     said += notes.of_dropped(taken.dropped, len(frames))
     used = sum(view.split != "test" for view in taken.views)
-    said += notes.of_blank(inputs.transforms.path, taken.blank, used)
+    said += notes.of_blank(inputs.cameras.path, taken.blank, used)
     said += _checked_alignment(task, taken)
     views = taken.views
     if settings.exposure == "estimate":
@@ -125,12 +125,12 @@ class _Task:
     @property
     def listed(self) -> bool:
         """Lists of the source say which photographs are held out."""
-        return any(frame.split for frame in self.inputs.transforms.frames)
+        return any(frame.split for frame in self.inputs.cameras.frames)
 
     def spread(self, count: int) -> set[str]:
         """Return the names of at most `count` frames, evenly spread."""
-        frames = self.inputs.transforms.frames
-        return {frames[i].name for i in transforms.evenly_spread(len(frames), count)}
+        frames = self.inputs.cameras.frames
+        return {frames[i].name for i in evenly_spread(len(frames), count)}
 
     def photograph(self, frame: Frame, view: View, gain: float) -> Photograph:
         """Decode the photograph of a frame at the size of its view."""
@@ -173,7 +173,7 @@ class _Taken:
 def _mesh(inputs: Inputs, source: Any) -> mesh.Mesh:
     of_vertices = inputs.of_vertices() if inputs.of_vertices else None
     found = mesh.load(inputs.mesh, inputs.metres, of_vertices, mesh_axes(source.mesh_up))
-    if found.from_nodes and any(frame.ids for frame in inputs.transforms.frames):
+    if found.from_nodes and any(frame.ids for frame in inputs.cameras.frames):
         found = replace(found, instance=None, names=None)
     return found
 
@@ -184,7 +184,7 @@ def _held_out(task: _Task, poses: Sequence[np.ndarray]) -> tuple[held_out.HeldOu
     Raises:
         InputError: that leaves no photograph to use.
     """
-    frames, every = task.inputs.transforms.frames, task.settings.test_every
+    frames, every = task.inputs.cameras.frames, task.settings.test_every
     listed = [frame.split or "train" for frame in frames]
     if "test" not in listed and (task.listed or not every):
         return held_out.HeldOut(listed, {}, np.zeros(0), np.zeros(0)), []
@@ -201,7 +201,7 @@ def _held_out(task: _Task, poses: Sequence[np.ndarray]) -> tuple[held_out.HeldOu
     if "train" not in found.split:
         fewer = "hold out fewer in its lists" if task.listed else "set `capture.test_every: 0`"
         raise InputError(
-            f"{task.inputs.transforms.path}: every photograph that is not held out repeats a held-out one (the same file, or the"
+            f"{task.inputs.cameras.path}: every photograph that is not held out repeats a held-out one (the same file, or the"
             f" same place to a pixel), so none is left to use: remove repeated photographs, or {fewer}"
         )
     if not len(found.distance):  # fewer photographs than `capture.test_every`
@@ -216,7 +216,7 @@ def _registered(
 ) -> tuple[registration.Registered, list[tuple[str, str]]]:
     """Return frames and poses registered with the mesh and the other photographs; also the (form, name) of those of an unusual
     format."""
-    frames = task.inputs.transforms.frames
+    frames = task.inputs.cameras.frames
     if task.source.registration == "off":
         return registration.Registered(list(frames), poses, {}, {}, [], []), []
     photos: list[Photo | None] = []
@@ -267,7 +267,7 @@ def _take(job: Job, task: _Task, posed: registration.Registered, gains: list[flo
         if blank := one.blank(task.encoded):
             out.blank[blank].append(view.name)
         if task.source.alignment != "off":
-            out.aligned.add_depth(frame, task.conventions, pinhole(view), depth, task.inputs.transforms.depth_unit)
+            out.aligned.add_depth(frame, task.conventions, pinhole(view), depth, task.inputs.cameras.depth_unit)
             edges = alignment.edge_pictures(seen.pixels, seen.valid, depth, task.room.normals_of(face))
             out.aligned.add_edges(frame.name, *edges, frame.name in compared)
             out.trials += [_trial(frame, view, seen)] * (frame.name in tried)
@@ -362,7 +362,7 @@ def _checked_alignment(task: _Task, taken: _Taken) -> list[str]:
     mode, tolerance = task.source.alignment, alignment.TOLERANCE
     if mode == "off":
         return ["alignment was not checked (`source.alignment: off`)"]
-    out, path = taken.aligned.notes(tolerance), task.inputs.transforms.path
+    out, path = taken.aligned.notes(tolerance), task.inputs.cameras.path
     pairs = list(zip(taken.frames, taken.views, strict=True))
     message = taken.aligned.refuse(path, tolerance, lambda: _better_depth(task, pairs))
     alignment.raise_or_note(message, mode, out)
@@ -383,7 +383,7 @@ def _sees_nothing(task: _Task, taken: _Taken) -> str:
     if not better:
         seen = [(f, v) for f, v in taken.blind if f.name in tried and v.split != "test"]
         better = _better_edges(task, [_trial(f, v, task.photograph(f, v, 1.0)) for f, v in seen], 0.0)
-    listed = task.inputs.transforms
+    listed = task.inputs.cameras
     return (
         f"{listed.path}: none of {len(listed.frames)} cameras sees {task.inputs.mesh.name} (rays that"
         f" hit it: {max(taken.dropped.values()):.1%} at most); "
@@ -397,10 +397,10 @@ def _better_depth(task: _Task, seen: list[tuple[Frame, View]]) -> str:
     pairs = [(f, pinhole(v)) for f, v in seen if f.depth is not None or (f.seen is not None and len(f.seen))]
     if not pairs:
         return ""
-    listed, tolerance = task.inputs.transforms, alignment.TOLERANCE
+    listed, tolerance = task.inputs.cameras, alignment.TOLERANCE
     return alignment.explain(pairs, task.room.depth_along, task.conventions, listed.known, listed.depth_unit, tolerance)
 
 
 def _better_edges(task: _Task, trials: list[alignment.Trial], now: float) -> str:
     """Say which other convention fits the edges of the photographs clearly better than the one in use, which has `now`."""
-    return alignment.explain_edges(trials, task.room.along, task.conventions, task.inputs.transforms.known, now)
+    return alignment.explain_edges(trials, task.room.along, task.conventions, task.inputs.cameras.known, now)

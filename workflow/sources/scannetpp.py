@@ -21,8 +21,10 @@ from workflow.intake.documents import read_json, reading
 from workflow.runtime.job import Job
 from workflow.sources import folder
 from workflow.sources.folder_scene import colmap, mesh, transforms
+from workflow.sources.folder_scene.camera import opencv_pose
+from workflow.sources.folder_scene.entries import Entry
+from workflow.sources.folder_scene.frames import Cameras, checked_frames, folder_at
 from workflow.sources.folder_scene.inputs import Inputs
-from workflow.sources.folder_scene.transforms import Entry
 
 MESH_FROM_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 """Exchanges rows 0 and 1 and negates row 2: a rotation that is its own inverse."""
@@ -59,7 +61,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool =
     Raises:
         InputError: missing or inconsistent files, by name.
     """
-    home = transforms.folder_at(source, "dslr/ and scans/")
+    home = folder_at(source, "dslr/ and scans/")
     for name in ("dslr", "scans"):
         if not (home / name).is_dir():
             below = [path.name for path in (home / "data", *home.iterdir()) if (path / "dslr").is_dir()]
@@ -75,7 +77,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool =
     entries, without_masks = _masked(entries, masks)
     notes += without_masks
     world = MESH_FROM_NERFSTUDIO if source["world"] == "nerfstudio" else None
-    listed = transforms.frames_of(cameras, document, entries, pictures, source, settings, world)
+    listed = checked_frames(cameras, document, entries, pictures, source, settings, world)
     listed, also = _compared_with_colmap(listed, dslr / "colmap", source["world"], points)
     mesh_path = scans / "mesh_aligned_0.05.ply"
     if not mesh_path.is_file():
@@ -136,9 +138,7 @@ def _masked(entries: list[Entry], masks: Path) -> tuple[list[Entry], list[str]]:
     return [replace(e, mask=masks / name, mask_full=True) for e, name in zip(entries, names, strict=True)], []
 
 
-def _compared_with_colmap(
-    listed: transforms.Transforms, model: Path, world: str, points: bool
-) -> tuple[transforms.Transforms, list[Path]]:
+def _compared_with_colmap(listed: Cameras, model: Path, world: str, points: bool) -> tuple[Cameras, list[Path]]:
     """Compare the poses with colmap/ (which may be missing), which is in the frame of the mesh; refuse poses that differ.
 
     Returns the frames, with their sparse points if `points`, and the files of the model.
@@ -173,7 +173,7 @@ def _compared_with_colmap(
 
 def _difference(opengl: list[np.ndarray], opencv: list[np.ndarray]) -> tuple[float, float]:
     """Return the median distance (metres) and angle (radians) between poses of OpenGL and of OpenCV axes."""
-    a, b = np.array([transforms.opencv_pose(m, "opengl", 1.0) for m in opengl]), np.array(opencv)
+    a, b = np.array([opencv_pose(m, "opengl", 1.0) for m in opengl]), np.array(opencv)
     chord = np.linalg.norm(a[:, :3, :3] - b[:, :3, :3], axis=(1, 2)) / np.sqrt(8)  # = sin(angle / 2)
     distance = np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)
     return float(np.median(distance)), float(np.median(2 * np.arcsin(np.clip(chord, 0, 1))))

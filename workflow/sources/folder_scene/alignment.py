@@ -16,7 +16,8 @@ from iif_core.errors import InputError
 from iif_core.surface.axes import AS_IS, TURNS, name_of, turn_of
 from workflow.settings.source import MESH_UP
 from workflow.sources.folder_scene import images
-from workflow.sources.folder_scene.transforms import METRES, Frame, opencv_pose
+from workflow.sources.folder_scene.camera import METRES, opencv_pose
+from workflow.sources.folder_scene.frames import Frame
 
 TOLERANCE = 0.05  # largest accepted median relative difference of depth, where depth images or sparse points exist
 DEPTH_SAMPLES = 20_000  # depth pixels compared per view

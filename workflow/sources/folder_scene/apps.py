@@ -13,8 +13,10 @@ import numpy as np
 from iif_core.errors import InputError
 from workflow.intake.documents import read_json, reading
 from workflow.intake.names import shown
-from workflow.sources.folder_scene import images, transforms
-from workflow.sources.folder_scene.transforms import Entry, Transforms
+from workflow.sources.folder_scene import images
+from workflow.sources.folder_scene.camera import fault_of_similarity
+from workflow.sources.folder_scene.entries import Entry
+from workflow.sources.folder_scene.frames import Cameras, checked_frames
 
 POLYCAM, RECORD3D, SCANNER = "Polycam", "Record3D", "3D Scanner App"
 MESHES = {POLYCAM: ("raw.glb",), RECORD3D: (), SCANNER: ("export_refined.obj", "export.obj")}
@@ -30,7 +32,7 @@ def find(folder: Path) -> str | None:
     return SCANNER if next(folder.glob("frame_*.json"), None) is not None else None
 
 
-def frames_of(app: str, folder: Path, source: dict[str, Any], capture: dict[str, Any]) -> Transforms:
+def frames_of(app: str, folder: Path, source: dict[str, Any], capture: dict[str, Any]) -> Cameras:
     """Read the frames of such a folder, with the same checks as for transforms.json.
 
     Raises:
@@ -39,7 +41,7 @@ def frames_of(app: str, folder: Path, source: dict[str, Any], capture: dict[str,
     path, entries, files, notes, world = {POLYCAM: _polycam, RECORD3D: _record3d, SCANNER: _scanner}[app](folder)
     if not entries:
         raise InputError(f"{path}: a folder of {app} without any photograph that has a camera; export the raw data again")
-    listed = transforms.frames_of(path, {}, entries, folder, source, capture, world)
+    listed = checked_frames(path, {}, entries, folder, source, capture, world)
     also = tuple(file for file in files if file != path)
     return replace(listed, axes="opengl", known=True, notes=(f"cameras: raw data of {app}", *notes), also=also)
 
@@ -85,7 +87,7 @@ def _polycam(folder: Path) -> _Found:
         read.append(info)
         # Stored column by column.
         world = None if turned is None else _array(info, "alignmentTransform", turned, (4, 4)).T
-        if world is not None and (fault := transforms.fault_of_similarity(world)):
+        if world is not None and (fault := fault_of_similarity(world)):
             raise InputError(f"{info}: `alignmentTransform` {fault}; export the raw data again")
     entries = []
     for file in files:

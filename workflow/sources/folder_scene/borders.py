@@ -10,8 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from workflow.sources.folder_scene.entries import evenly_spread
+from workflow.sources.folder_scene.frames import Frame
 from workflow.sources.folder_scene.images import Photo
-from workflow.sources.folder_scene.transforms import Frame, evenly_spread
 
 BLACK, MEDIAN = 16 / 255, 2 / 255
 """Largest sensor value of a border, as JPEG leaves it, and of the median of its pixels."""

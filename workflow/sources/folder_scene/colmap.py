@@ -19,9 +19,9 @@ from iif_core.errors import InputError
 from workflow.intake import limits
 from workflow.intake.documents import check_file, reading
 from workflow.intake.names import existing, forward, shown
-from workflow.sources.folder_scene import transforms
+from workflow.sources.folder_scene.entries import Entry, fault_of_path
+from workflow.sources.folder_scene.frames import Cameras, checked_frames
 from workflow.sources.folder_scene.images import EXTENSIONS
-from workflow.sources.folder_scene.transforms import Entry, Transforms
 
 PARTS = ("cameras", "images", "points3D")
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap")
@@ -147,13 +147,13 @@ def _count(data: bytes, least: int) -> int:
 def entry_of(model: Model, image: Image) -> Entry:
     """Return an entry like those of transforms.json, but with camera-to-world of OpenCV axes."""
     where = f"image {shown(image.name)}"
-    if fault := transforms.fault_of_path(image.name):
+    if fault := fault_of_path(image.name):
         raise InputError(f"{model.path}: {where}: its name {fault}")
     keys = {**model.cameras[image.camera], "transform_matrix": image.pose.tolist()}
     return Entry(image.name, where, keys, seen=model.seen(image)[0])
 
 
-def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[str, Any], points: bool) -> Transforms:
+def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[str, Any], points: bool) -> Cameras:
     """Read the frames of a folder whose cameras are a COLMAP model, with the same checks as for transforms.json.
 
     Args:
@@ -177,7 +177,7 @@ def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[s
     # COLMAP's own form of the name; 0001.png would be a mask of objects (docs/guide/segmentation.md).
     named = {entry.file_path: existing(masks / f"{entry.file_path}.png") for entry in entries}
     entries = [replace(entry, mask=named[entry.file_path]) if named[entry.file_path].is_file() else entry for entry in entries]
-    listed = transforms.frames_of(model.path, {}, entries, root, source, capture)
+    listed = checked_frames(model.path, {}, entries, root, source, capture)
     if points:
         _check_reprojection(model, listed)
     names = {image.name for image in model.images}
@@ -189,7 +189,7 @@ def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[s
     return replace(listed, axes="opencv", known=True, notes=tuple(notes), also=model.files)
 
 
-def _check_reprojection(model: Model, listed: Transforms) -> None:
+def _check_reprojection(model: Model, listed: Cameras) -> None:
     """Refuse cameras that do not project the sparse points to their keypoints, as after an edit or with another model's file."""
     found = {image.name: image for image in model.images}
     errors = {}

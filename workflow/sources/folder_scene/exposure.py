@@ -15,7 +15,7 @@ from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
 from workflow.intake import limits
 from workflow.intake.documents import read_json
 from workflow.intake.names import shown
-from workflow.sources.folder_scene.transforms import Frame
+from workflow.sources.folder_scene.frames import Frame
 
 MAX_PIXELS = 2_000_000  # of all views together
 MIN_CELL_EDGE = 0.02  # metres; finer cells would hold single pixels

@@ -12,7 +12,8 @@ import numpy as np
 from iif_core.errors import InputError
 from workflow.settings.names import did_you_mean_path
 from workflow.sources.folder_scene import apps, colmap, exposure, images, mesh, photogrammetry, transforms
-from workflow.sources.folder_scene.transforms import Frame
+from workflow.sources.folder_scene.camera import metres_per_unit
+from workflow.sources.folder_scene.frames import Cameras, Frame, folder_at
 
 TRUTH = ("albedo", "roughness", "metallic", "emission")
 
@@ -22,7 +23,7 @@ class Inputs:
     """Every file that the capture of a scene reads.
 
     Attributes:
-        transforms: the checked cameras.
+        cameras: the checked ones.
         mesh: the mesh file.
         exposures: exposures.json.
         metres: per unit of the poses and of the mesh.
@@ -32,7 +33,7 @@ class Inputs:
         also: further files that are read.
     """
 
-    transforms: transforms.Transforms
+    cameras: Cameras
     mesh: Path
     exposures: Path | None = None
     metres: float = 1.0
@@ -57,15 +58,15 @@ class Inputs:
                 depth_matrix=moved(frame.depth_matrix),
                 seen=None if frame.seen is None else frame.seen - own,
             )
-            for frame in self.transforms.frames
+            for frame in self.cameras.frames
         )
-        return replace(self, transforms=replace(self.transforms, frames=frames))
+        return replace(self, cameras=replace(self.cameras, frames=frames))
 
     def files(self) -> list[Path]:
         """List all files."""
-        out = [self.transforms.path, self.mesh, *([self.exposures] if self.exposures else [])]
-        out += [path for frame in self.transforms.frames for path in frame.files()]
-        return [*out, *self.transforms.also, *self.also]
+        out = [self.cameras.path, self.mesh, *([self.exposures] if self.exposures else [])]
+        out += [path for frame in self.cameras.frames for path in frame.files()]
+        return [*out, *self.cameras.also, *self.also]
 
 
 def find_inputs(source: dict[str, Any], capture: dict[str, Any], points: bool = False) -> Inputs:
@@ -75,8 +76,8 @@ def find_inputs(source: dict[str, Any], capture: dict[str, Any], points: bool = 
     Raises:
         InputError: missing or unusable files, by name.
     """
-    metres = transforms.metres_per_unit(source["unit"])
-    folder = transforms.folder_at(source, "transforms.json, a COLMAP model, or the export of a program")
+    metres = metres_per_unit(source["unit"])
+    folder = folder_at(source, "transforms.json, a COLMAP model, or the export of a program")
     listed, meshes = _cameras(folder, source, capture, points)
     if capture["test_every"] == 1:
         raise InputError("`capture.test_every: 1` keeps every view for testing; give 0 (none) or 2 and more")
@@ -90,9 +91,7 @@ def find_inputs(source: dict[str, Any], capture: dict[str, Any], points: bool = 
     return Inputs(replace(listed, frames=frames), mesh_path, exposures if has_exposures else None, metres)
 
 
-def _cameras(
-    folder: Path, source: dict[str, Any], capture: dict[str, Any], points: bool
-) -> tuple[transforms.Transforms, tuple[str, ...]]:
+def _cameras(folder: Path, source: dict[str, Any], capture: dict[str, Any], points: bool) -> tuple[Cameras, tuple[str, ...]]:
     """Read the cameras of a folder, by whichever program wrote them; also the names of meshes that this program exports."""
     stated = source["cameras"]
     if str(stated).endswith("transforms.json") or (stated is None and (folder / "transforms.json").is_file()):

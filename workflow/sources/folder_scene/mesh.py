@@ -22,7 +22,7 @@ from workflow.intake.meshes import AGAIN, check_faces, check_mesh
 from workflow.intake.obj import read_obj
 from workflow.intake.ply import read_ply
 from workflow.settings.names import did_you_mean_path
-from workflow.sources.folder_scene.transforms import METRES
+from workflow.sources.folder_scene.camera import METRES
 
 NAMES = ("mesh.ply", "mesh.obj", "mesh.glb")
 SUFFIXES = (".ply", ".obj", ".glb")

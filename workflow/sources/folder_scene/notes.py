@@ -10,8 +10,8 @@ import numpy as np
 from iif_core.camera.exposure import ExposureGains
 from iif_core.errors import InputError
 from workflow.scene.normal_form import View
+from workflow.sources.folder_scene.frames import Frame
 from workflow.sources.folder_scene.mesh import Mesh
-from workflow.sources.folder_scene.transforms import Frame
 
 MAX_LOG_PIXEL_ASPECT = 0.1  # |log(fl_x / fl_y)| above which a note asks whether it is right; real lenses stay below 0.01
 

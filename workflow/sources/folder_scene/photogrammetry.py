@@ -15,8 +15,8 @@ from workflow.intake import limits
 from workflow.intake.documents import read_json, read_text, reading
 from workflow.intake.names import existing, forward, shown
 from workflow.settings.names import did_you_mean_path
-from workflow.sources.folder_scene import transforms
-from workflow.sources.folder_scene.transforms import Entry, Transforms
+from workflow.sources.folder_scene.entries import Entry
+from workflow.sources.folder_scene.frames import Cameras, checked_frames
 
 SUFFIXES = (".xml", ".sfm")
 NAMES = ("cameras.xml", "cameras.sfm", "sfm.json")
@@ -42,7 +42,7 @@ def find(folder: Path, stated: str | None) -> Path | None:
     return next((folder / name for name in NAMES if (folder / name).is_file()), None)
 
 
-def frames_of(folder: Path, path: Path, source: dict[str, Any], capture: dict[str, Any]) -> Transforms:
+def frames_of(folder: Path, path: Path, source: dict[str, Any], capture: dict[str, Any]) -> Cameras:
     """Read the frames of such a file, with the same checks as for transforms.json.
 
     Raises:
@@ -56,7 +56,7 @@ def frames_of(folder: Path, path: Path, source: dict[str, Any], capture: dict[st
     if not root.is_dir() and source["images"] != DEFAULT_IMAGES:
         raise InputError(f"{root}: not found (`source.images`).{did_you_mean_path(root)}")
     root = root if root.is_dir() else folder
-    listed = transforms.frames_of(path, {}, entries, root, source, capture, world)
+    listed = checked_frames(path, {}, entries, root, source, capture, world)
     notes = [f"cameras: {program}"]
     if without:
         notes.append(f"{len(without)} photographs have no pose in {path.name} and are not used, such as {without[0]}")

@@ -14,7 +14,7 @@ from iif_core.errors import InputError
 from iif_core.numerics.color import linear_from_srgb
 from workflow.scene.normal_form import Truth, View
 from workflow.sources.folder_scene import alignment, images
-from workflow.sources.folder_scene.transforms import Frame
+from workflow.sources.folder_scene.frames import Frame
 
 BLACK, WHITE = 2.5 / 255, 253.5 / 255  # sensor values of all channels below and above which a pixel tells nothing about the light
 EVERYWHERE = 0.999  # share of such pixels that makes a photograph black or white

@@ -11,7 +11,7 @@ import numpy as np
 from iif_core.camera.alignment import Photo
 from iif_core.camera.registration import MIN_VIEWS, Registration, register
 from workflow.decisions import camera as decisions
-from workflow.sources.folder_scene.transforms import Frame
+from workflow.sources.folder_scene.frames import Frame
 
 WIDTH = 200  # pixels; photographs are reduced to at most this width before they are compared
 MAX_ROWS = 300_000  # points times views; a capture registers within some ten seconds
