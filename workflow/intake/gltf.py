@@ -36,6 +36,9 @@ _MOST_INSTANCES = 100_000
 _AS_FLOATS = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_")
 """Attributes that a reader may expect as floats."""
 
+_PLACES = ("TRANSLATION", "ROTATION", "SCALE")
+"""Attributes of an instance that say where it is."""
+
 Document = dict[str, Any]
 
 
@@ -218,9 +221,6 @@ class _Plain:
             placed = {key: values[i].astype(float).tolist() for key, values in named.items()}
             below.append(len(nodes))
             nodes.append({"name": f"{name} {i + 1}", "mesh": mesh} | placed)
-
-
-_PLACES = ("TRANSLATION", "ROTATION", "SCALE")
 
 
 def _of_fan(index: np.ndarray) -> np.ndarray:

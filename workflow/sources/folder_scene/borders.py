@@ -32,7 +32,8 @@ def find_borders(frames: Sequence[Frame], encoded: bool, read: Callable[[Frame],
     """Return the border (H, W) bool of photographs of each size (width, height) that have one.
 
     Args:
-        frames: that may be read; encoded: they hold sensor values, otherwise a border is exactly 0.
+        frames: the photographs to look at.
+        encoded: whether they hold sensor values, whose borders are nearly 0; those of linear values are exactly 0.
         read: decodes a photograph.
     """
     of_size: dict[Size, list[Frame]] = {}
