@@ -34,6 +34,10 @@ class PhotographedSource(Section):
     close_holes: float = Field(0.5, ge=0)
     """Close holes of the mesh up to so many metres across, where the filling continues the surface around; 0: leave them open.
     Through a hole light is lost, and comes in that was never there."""
+    close: Literal["none", "box", "planes"] = "none"
+    """Build the walls, floor and ceiling that a scan lacks: `box`: six sides at its extent; `planes`: its large outer planes,
+    prolonged until they meet, and sides of that box where there are none. No pixel shows what was built; it reflects light, keeps
+    light out, and each side of it may shine. Windows without a pane are closed too."""
     colour: Literal["file", "srgb", "linear", "display_p3", "adobe_rgb", "rec2020", "acescg"] = "file"
     """Colour space of the photographs: as each file says, or one for all, whatever they say. Of EXR files, which are linear, it
     gives the primaries."""

@@ -101,7 +101,11 @@ def capture_photographs(job: Job, inputs: Inputs) -> None:
     said += notes.of_pixels(posed.frames, taken.counts, [*forms, *taken.forms])
     said += notes.of_views(posed.frames, views, task.listed, settings.test_every, task.encoded)
     said += notes.of_objects(posed.frames, surface, inputs.mesh.name)
-    _write(job, task, posed, taken, views, surface, said, held.facts(names), decision, origin)
+    # Cameras see the scan alone: what an added wall would show is not what is there.
+    closed = surface.enclosed(source.close, [view.world_from_camera for view in views])
+    said += closed.notes[len(surface.notes) :]
+    facts = held.facts(names), len(closed.faces) - len(surface.faces)
+    _write(job, task, posed, taken, views, closed, said, *facts, decision, origin)
 
 
 @dataclass(frozen=True)
@@ -316,6 +320,7 @@ def _write(
     surface: mesh.Mesh,
     said: list[str],
     held: dict[str, object],
+    added: int,
     decided: list[Decision],
     origin: np.ndarray,
 ) -> None:
@@ -332,6 +337,7 @@ def _write(
         "exposure_estimated": task.settings.exposure == "estimate",
         "stated_exposure": _stated(task, posed.frames),
         **({"held_out": held} if held else {}),
+        **({"added_faces": added} if added else {}),
     }
     has_truth = any(frame.truth for frame in posed.frames)
     writer.finish(task.source.kind, task.settings.dynamic_range, has_truth, said, task.inputs.response, facts)

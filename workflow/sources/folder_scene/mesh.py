@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.surface.axes import AS_IS, turn_of
+from iif_core.surface.enclosure import enclosure
 from iif_core.surface.holes import close_holes
 from iif_core.surface.triangles import face_geometry
 from workflow.intake import limits
@@ -37,6 +38,7 @@ faces."""
 FARTHEST = 1000.0
 """Metres from the origin beyond which an origin of the scene's own is subtracted: single precision, in which rays are traced, is
 0.06 mm there, and half a metre where projected coordinates of a map are."""
+UPRIGHT = 0.8  # cosine with the vertical from which a side is a floor or a ceiling
 TYPICAL_DIAGONAL = 7.0  # metres; the unit that comes nearest to it is proposed
 
 
@@ -69,6 +71,31 @@ class Mesh:
         faces = np.concatenate([self.faces, found.faces.astype(self.faces.dtype)])
         instance = None if self.instance is None else np.concatenate([self.instance, self.instance[found.beside]])
         return replace(self, faces=faces, instance=instance, notes=[*self.notes, note])
+
+    def enclosed(self, kind: Literal["none", "box", "planes"], poses: Sequence[np.ndarray]) -> Mesh:
+        """Add walls, floor and ceiling around the mesh and the cameras at `poses` (v, 4, 4)."""
+        if kind == "none":
+            return self
+        placed = np.asarray(poses)
+        found = enclosure(self.vertices, self.faces, placed[:, :3, 3], kind)
+        up = -placed[:, :3, 1].mean(0)
+        upright = found.normal @ up / max(float(np.linalg.norm(up)), 1e-12)
+        names = np.where(upright > UPRIGHT, "floor", np.where(upright < -UPRIGHT, "ceiling", "wall"))
+        names = [f"added {name} {i + 1}" for i, name in enumerate(names)]
+        area = np.bincount(found.side, face_geometry(found.vertices, found.faces)[1])
+        note = (
+            f"mesh: {len(names)} sides were added around it (source.close: {kind}), {area.sum():.3g} m2, of which"
+            f" {found.from_plane.sum()} prolong planes of the mesh: what they are made of is not known"
+        )
+        of_scan = 0 if self.names is None else len(self.names)
+        return replace(
+            self,
+            vertices=np.concatenate([self.vertices, found.vertices]),
+            faces=np.concatenate([self.faces, (found.faces + len(self.vertices)).astype(self.faces.dtype)]),
+            instance=None if self.instance is None else np.concatenate([self.instance, (found.side + of_scan).astype(np.int32)]),
+            names=None if self.names is None else [*self.names, *names],
+            notes=[*self.notes, note],
+        )
 
     def from_origin(self, origin: np.ndarray) -> Mesh:
         """Return the mesh relative to an origin (3,), metres."""

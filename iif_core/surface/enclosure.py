@@ -1,0 +1,168 @@
+"""Walls, floor and ceiling that a scan lacks: planes around it, put together to one closed surface."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import HalfspaceIntersection
+
+from iif_core.surface.triangles import face_geometry
+
+ALIKE = float(np.cos(np.radians(10.0)))
+"""Cosine of the largest angle between normals of one direction."""
+BESIDE = 0.1
+"""Thickness (m) of the layer in which faces of one direction make a plane."""
+LEAST = 0.02
+"""Least share of the area of a mesh that makes a plane of it."""
+BEYOND = 0.01
+"""Largest share of the area that may lie behind a plane that bounds the room: what was scanned through a window."""
+_BINS = 32  # of normals, along each axis
+_DIRECTIONS = 24  # of planes that are looked at, the largest first
+
+
+class Enclosure(NamedTuple):
+    """A closed convex surface.
+
+    Attributes:
+        vertices: (n, 3) float64; faces: (m, 3) int64, whose normals point inward.
+        side: (m,) int64, of each face.
+        normal: (s, 3) float64 unit, of each side, inward.
+        from_plane: (s,) bool, the side prolongs a plane of the mesh; else it bounds the extent.
+    """
+
+    vertices: NDArray
+    faces: NDArray
+    side: NDArray
+    normal: NDArray
+    from_plane: NDArray
+
+
+def enclosure(
+    vertices: ArrayLike, faces: ArrayLike, within: ArrayLike, kind: Literal["box", "planes"], margin: float = 0.02
+) -> Enclosure:
+    """Build the closed surface around a scan.
+
+    `box` has six sides, along the three directions at right angles that most area of the scan faces. `planes` has the large
+    planes of the scan that next to nothing lies behind, prolonged until they meet, and sides of that box where there are none.
+
+    Args:
+        vertices, faces: (n, 3), metres, and (m, 3) of the scan, of which some have an area.
+        within: (k, 3) points that are inside, at least one: cameras.
+        kind: which of the two.
+        margin: distance (m) of the sides behind what they close, so that walls of the scan stay in front.
+
+    Returns:
+        The surface. It contains all points, and the scan but for what lies behind its planes (at most `BEYOND` of the area each).
+    """
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+    within = np.asarray(within, np.float64).reshape(-1, 3)
+    normal, area = face_geometry(vertices, faces)
+    directions = _directions(normal, area)
+
+    # -------- six sides along the axes of the room, at the extent of everything --------
+    axes = _right_angled(directions)
+    outward = np.concatenate([axes, -axes])
+    bound = np.maximum((vertices[np.unique(faces)] @ outward.T).max(0), (within @ outward.T).max(0))
+
+    # -------- planes of the scan that have nearly all of it, and every camera, on one side --------
+    found = np.zeros((0, 4))
+    if kind == "planes":
+        middle = vertices[faces].mean(1)
+        signed = [sign * direction for direction in directions for sign in (1.0, -1.0)]
+        at = [_bounding(middle @ n, np.abs(normal @ n) >= ALIKE, area, float((within @ n).max())) for n in signed]
+        found = np.array([[*n, d] for n, d in zip(signed, at, strict=True) if d is not None]).reshape(-1, 4)
+        lacking = (outward @ found[:, :3].T < ALIKE).all(1)
+        outward, bound = outward[lacking], bound[lacking]
+
+    both = np.concatenate([found[:, :3], outward]), np.concatenate([found[:, 3], bound]) + margin
+    return _polyhedron(*both, np.arange(len(both[0])) < len(found), within.mean(0))
+
+
+def _directions(normal: NDArray, area: NDArray) -> NDArray:
+    """Return directions (k, 3) that much of the area faces, whichever way round, the largest first."""
+    # Normals become the means of bins of a few degrees; a face and one that is turned over are of the same.
+    turned = np.where(_first_sign(normal)[:, None] < 0, -normal, normal)
+    key = (np.rint(turned * _BINS).astype(np.int64) + _BINS) @ [(2 * _BINS + 1) ** 2, 2 * _BINS + 1, 1]
+    of_face = np.unique(key, return_inverse=True)[1].ravel()
+    weight = np.bincount(of_face, area)
+    axis = np.stack([np.bincount(of_face, area * component) for component in turned.T], 1)
+    axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-300)
+    found, left = [], weight.copy()
+    while len(found) < _DIRECTIONS:
+        seeds = np.argsort(-left, kind="stable")[:64]
+        near = np.abs(axis[seeds] @ axis.T) >= ALIKE
+        best = int(np.argmax(near @ left))
+        if left[near[best]].sum() < LEAST * weight.sum() and found:
+            break
+        # The mean of an axis is the eigenvector of its moments.
+        one = axis[near[best]]
+        mean = np.linalg.eigh((one * left[near[best], None]).T @ one)[1][:, -1]
+        found.append(mean * (_first_sign(mean[None])[0] or 1.0))
+        left[near[best]] = 0.0
+        if not left.any():
+            break
+    return np.array(found)
+
+
+def _first_sign(vector: NDArray) -> NDArray:
+    """Return the sign (n,) of the first component of vectors (n, 3) that is not small."""
+    large = np.abs(vector) > 0.5 / _BINS
+    return np.sign(np.take_along_axis(vector, large.argmax(1)[:, None], 1)[:, 0])
+
+
+def _right_angled(directions: NDArray) -> NDArray:
+    """Return three axes (3, 3) at right angles: the first direction, the next that is nearly square to it, and their cross."""
+    first = directions[0]
+    square = directions[np.abs(directions @ first) < np.sqrt(1 - ALIKE**2)]
+    second = square[0] if len(square) else np.eye(3)[np.abs(first).argmin()]
+    second = second - (second @ first) * first
+    second /= np.linalg.norm(second)
+    return np.stack([first, second, np.cross(first, second)])
+
+
+def _bounding(place: NDArray, faces_it: NDArray, area: NDArray, least: float) -> float | None:
+    """Return where the outermost plane of one direction lies, None = there is none that bounds the room.
+
+    Args:
+        place: (m,) of each face along the direction.
+        faces_it: (m,) bool, the face is square to the direction.
+        area: (m,).
+        least: place of the outermost camera.
+    """
+    low = place.min()
+    layer = ((place - low) / BESIDE).astype(np.int64)
+    own, every = np.bincount(layer, area * faces_it, layer.max() + 2), np.bincount(layer, area, layer.max() + 2)
+    behind = np.append(np.cumsum(every[::-1])[::-1], 0.0)
+    # A plane may lie across the border of two layers.
+    two = own[:-1] + own[1:]
+    fits = (two >= LEAST * area.sum()) & (behind[2 : len(two) + 2] <= BEYOND * area.sum())
+    for k in np.flatnonzero(fits)[::-1]:
+        of_plane = faces_it & (layer >= k) & (layer <= k + 1)
+        at = float(place[of_plane].max())
+        if at >= least:
+            return at
+    return None
+
+
+def _polyhedron(outward: NDArray, bound: NDArray, from_plane: NDArray, inside: NDArray) -> Enclosure:
+    """Put the half-spaces n . x <= bound together; `inside`: (3,) a point that lies in all of them."""
+    corners = HalfspaceIntersection(np.column_stack([outward, -bound]), inside).intersections
+    size = np.ptp(corners, axis=0).max()
+    corners = np.unique(np.round(corners / (1e-9 * size)).astype(np.int64), axis=0) * (1e-9 * size)
+    faces, side, kept = [], [], []
+    for n, d, planar in zip(outward, bound, from_plane, strict=True):
+        on = np.flatnonzero(np.abs(corners @ n - d) <= 1e-6 * size)
+        if len(on) < 3:  # the other sides cut all of it away
+            continue
+        # Around the middle of a side, such that its front is inside.
+        across = np.eye(3)[np.abs(n).argmin()]
+        u = np.cross(n, across)
+        from_middle = corners[on] - corners[on].mean(0)
+        on = on[np.argsort(np.arctan2(from_middle @ u, from_middle @ np.cross(n, u)))]
+        faces += [(on[0], on[i], on[i + 1]) for i in range(1, len(on) - 1)]
+        side += [len(kept)] * (len(on) - 2)
+        kept.append((*-n, planar))
+    kept_array = np.array(kept, np.float64)
+    return Enclosure(corners, np.array(faces, np.int64), np.array(side), kept_array[:, :3], kept_array[:, 3] > 0)
