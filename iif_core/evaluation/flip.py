@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from iif_core.numerics.color import linear_from_srgb
+from iif_core.numerics.color import lab_from_relative, linear_from_srgb
 from iif_core.numerics.filters import correlate
 
 Array = np.ndarray
@@ -93,11 +93,8 @@ class Seen:
 
 def _hunt_lab(linear: Array) -> Array:
     """(3, ...) linear sRGB -> L* and Hunt-adjusted a*, b*."""
-    t = np.tensordot(_matrices()[0].astype(linear.dtype), linear, 1)
-    bend = 6 / 29
-    x, y, z = np.where(t > bend**3, np.cbrt(t), t / (3 * bend**2) + 4 / 29)
-    lightness = 116 * y - 16
-    return np.stack([lightness, 0.01 * lightness * 500 * (x - y), 0.01 * lightness * 200 * (y - z)])
+    lightness, a, b = lab_from_relative(np.tensordot(_matrices()[0].astype(linear.dtype), linear, 1))
+    return np.stack([lightness, 0.01 * lightness * a, 0.01 * lightness * b])
 
 
 def _colour_distance(p: Array, q: Array) -> Array:

@@ -85,6 +85,24 @@ def _xyz_of(primaries: ArrayLike) -> tuple[Array, Array]:
     return columns[:, :3] * np.linalg.solve(columns[:, :3], columns[:, 3]), columns[:, 3]
 
 
+def lab_from_linear(rgb: ArrayLike) -> Array:
+    """Return CIELAB (..., 3) of linear Rec.709 (..., 3) in [0, 1], white D65: L* in [0, 100], a*, b* (ISO/CIE 11664-4).
+
+    >>> lab_from_linear([1.0, 1.0, 1.0]).round(6) + 0.0
+    array([100.,   0.,   0.])
+    """
+    to_xyz, white = _xyz_of(REC709_PRIMARIES)
+    relative = np.asarray(rgb, np.float64) @ (to_xyz / white[:, None]).T
+    return np.moveaxis(lab_from_relative(np.moveaxis(relative, -1, 0)), 0, -1)
+
+
+def lab_from_relative(xyz: Array) -> Array:
+    """Return CIELAB (3, ...) of CIE XYZ (3, ...) over that of white (ISO/CIE 11664-4); the dtype stays."""
+    bend = 6 / 29
+    x, y, z = np.where(xyz > bend**3, np.cbrt(xyz), xyz / (3 * bend**2) + 4 / 29)
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
 def luminance(rgb: ArrayLike) -> Array:
     """Compute the luminance 0.2126 R + 0.7152 G + 0.0722 B of linear colours (..., 3); result (...)."""
     rgb = _floating(rgb)

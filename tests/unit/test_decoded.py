@@ -15,7 +15,7 @@ from workflow.priors import correction
 from workflow.priors import views as of_priors
 from workflow.priors.views import CaptureViews
 from workflow.scene.decoded import DecodedViews, Kept
-from workflow.segmentations.geometry import mean_face_colour
+from workflow.segmentations.face_colour import mean_face_colour
 from workflow.segmentations.surface import Surface
 
 

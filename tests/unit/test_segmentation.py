@@ -10,7 +10,7 @@ from tests.errors import refused
 from tests.unit import own_scene as own
 from workflow.artifacts import StageReader
 from workflow.artifacts.store import ids_from_disk
-from workflow.segmentations.geometry import mean_face_colour
+from workflow.segmentations.face_colour import mean_face_colour
 
 
 def tables(root):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from workflow.settings.names import did_you_mean
 
 
 def object_number(key: object, names: list[str], where: str) -> int:
-    """Return the id of the object that a key of the settings means: its name, or else its id.
+    """Return the id of the object that a key of the settings means: its name, or else its id, alone or as `piece 24`.
 
     Raises:
         InputError: there is no such object, or several have this name; `where` is the setting, for the message.
@@ -26,8 +27,9 @@ def object_number(key: object, names: list[str], where: str) -> int:
         return found[0]
     if len(found) > 1:
         raise InputError(f"{where}: {text!r} is the name of {len(found)} objects; name it by its id, one of {found}")
-    if text.isdigit() and int(text) < len(names):
-        return int(text)
+    number = re.fullmatch(r"(?:(?:piece|object) )?(\d+)", text)
+    if number and int(number[1]) < len(names):
+        return int(number[1])
     hint = did_you_mean(text, names, "{!r}")
     listed = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
     raise InputError(f"{where}: there is no object {text!r}.{hint} Allowed: a name or an id of objects.parquet, such as {listed}")

@@ -122,8 +122,7 @@ def cluster_views(surface: Surface, views: list[View], load: Load, options: Cons
         "objects_parted": parted,
         "objects_joined": united,
     }
-    names = [f"{'object' if v else 'piece'} {i}" for i, v in enumerate(voted)]
-    return Objects(label.astype(np.int32), names, agreement, facts)
+    return Objects(label.astype(np.int32), None, agreement, facts)
 
 
 def _with_origin(

@@ -34,7 +34,7 @@ def measure_stability(
     Returns:
         The stability; without a value if the runs change nothing.
     """
-    count, values, best = len(objects.names), [], []
+    count, values, best = len(objects.agreement), [], []
     folds = range(FOLDS) if kind.perturbs(surface) else ()
     for fold in folds:
         progress(fold, FOLDS, "perturbed runs")

@@ -24,13 +24,13 @@ class Objects:
 
     Attributes:
         object_of_face: (m,) int32 from 0 without gaps.
-        names: of the objects.
+        names: of the objects; None = nobody has named them, and they are called by what they are like.
         agreement: (objects,) share of the pixels that agree.
         facts: numbers for segmentation.json.
     """
 
     object_of_face: np.ndarray
-    names: list[str]
+    names: list[str] | None
     agreement: np.ndarray
     facts: dict[str, int | float]
 

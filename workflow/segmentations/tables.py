@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,14 @@ def face_columns(objects: Objects) -> dict[str, np.ndarray]:
     return {"face_id": np.arange(len(objects.object_of_face), dtype=np.int32), "object_id": objects.object_of_face}
 
 
-def object_columns(surface: Surface, objects: Objects, stability: Stability, segments: SegmentTable) -> dict[str, Any]:
+def object_columns(
+    surface: Surface, objects: Objects, names: Sequence[str], stability: Stability, segments: SegmentTable
+) -> dict[str, Any]:
     """Return the columns of objects.parquet: size, what was seen and how reliable it is; stability -1 where nothing is known."""
-    count, area = len(objects.names), face_geometry(surface.vertices, surface.faces)[1]
+    count, area = len(names), face_geometry(surface.vertices, surface.faces)[1]
     return {
         "object_id": np.arange(count, dtype=np.int32),
-        "name": objects.names,
+        "name": list(names),
         "faces": np.bincount(objects.object_of_face, minlength=count).astype(np.int32),
         "area_m2": np.bincount(objects.object_of_face, area, count).astype(np.float32),
         "pixels": np.bincount(segments.object, segments.pixels, count).astype(np.int64),

@@ -6,6 +6,7 @@ import importlib
 
 import numpy as np
 
+from iif_core.objects.description import described
 from iif_core.objects.options import BorderOptions
 from iif_core.surface.segments import interior, segment_table
 from workflow import plugins
@@ -13,8 +14,9 @@ from workflow.artifacts.store import ids_to_disk
 from workflow.decisions import objects as decisions
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader
+from workflow.segmentations.face_colour import object_albedo
 from workflow.segmentations.stability import measure_stability
-from workflow.segmentations.surface import Surface
+from workflow.segmentations.surface import Objects, Surface
 from workflow.segmentations.tables import UNITS, face_columns, object_columns, segment_columns
 from workflow.settings.options import options_of
 
@@ -44,11 +46,12 @@ def run(job: Job) -> None:
         job.writer.exr(f"maps/{view.name}.exr", {**ids, "interior": interior(object_map, border)})
         job.progress(done, len(capture.views), "maps")
 
+    names = objects.names or _described(surface, objects)
     view_ids = np.array([view.view_id for view in capture], np.int32)
     job.writer.table("faces.parquet", face_columns(objects))
-    job.writer.table("objects.parquet", object_columns(surface, objects, stability, segments), UNITS)
+    job.writer.table("objects.parquet", object_columns(surface, objects, names, stability, segments), UNITS)
     job.writer.table("segments.parquet", segment_columns(segments, view_ids))
-    count, seen = len(objects.names), len(np.unique(segments.object))
+    count, seen = len(names), len(np.unique(segments.object))
     document = {
         "kind": own.kind,
         "objects": count,
@@ -61,3 +64,12 @@ def run(job: Job) -> None:
     }
     job.writer.json("segmentation.json", document)
     job.log.info("%d objects, %d of them seen, %d segments in %d views", count, seen, len(segments), len(maps))
+
+
+def _described(surface: Surface, objects: Objects) -> list[str]:
+    """Return names by colour and place for objects without one; what the capture built around the scan comes last in its mesh."""
+    albedo, pixels = object_albedo(surface, objects)
+    label = objects.object_of_face
+    built = np.ones(len(albedo), bool)
+    built[label[: len(label) - int(surface.capture.facts.get("added_faces", 0))]] = False
+    return described(label, surface.vertices, surface.faces, albedo, pixels > 0, surface.capture.up, built)
