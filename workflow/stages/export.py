@@ -9,6 +9,7 @@ from workflow.exporters import camera_files
 from workflow.exporters.atlas import bake, base_color_picture, encoded, read_parts, surface_picture, texture_facts
 from workflow.exporters.emitter_table import UNITS, emitter_columns
 from workflow.exporters.glb import fitting_glb
+from workflow.exporters.joining import joined
 from workflow.exporters.mitsuba_scene import mitsuba_files
 from workflow.exporters.normal_map import normal_picture
 from workflow.exporters.object_table import csv_bytes, recovered_objects
@@ -40,7 +41,8 @@ def run(job: Job) -> None:
     notes = provenance | ({"environment": outside | has_map} if outside else {})
     bumpy = wanted.normal_map and any(part.simplified for part in parts)
     normals = normal_picture(parts, recovered, atlas.size) if bumpy else None
-    data, texture = fitting_glb(parts, atlas, up, notes, capture.views, wanted.max_mb, normals)
+    taken = joined(parts, wanted.max_parts)
+    data, texture = fitting_glb(taken, atlas, up, notes, capture.views, wanted.max_mb, normals)
     job.writer.bytes("scene.glb", data)
     job.log.info("scene.glb: %.1f MB, textures of %d x %d as %s", texture["mb"], *2 * (texture["size"],), texture["format"])
     if not texture["fits"]:
@@ -52,8 +54,8 @@ def run(job: Job) -> None:
     job.writer.bytes(BASE_COLOR, encoded(base_color_picture(atlas)))
     job.writer.bytes(SURFACE, encoded(surface_picture(atlas)))
     job.writer.bytes(MASK, encoded(np.where(atlas.seen, 255, 0).astype(np.uint8)))
-    job.writer.bytes("scene.usdc", usd_bytes(parts, up, environment, capture.views, provenance))
-    for name, data in mitsuba_files(parts, atlas, capture.views[:MAX_SENSORS], environment).items():
+    job.writer.bytes("scene.usdc", usd_bytes(taken, up, environment, capture.views, provenance))
+    for name, data in mitsuba_files(taken, atlas, capture.views[:MAX_SENSORS], environment).items():
         job.writer.bytes(f"mitsuba/{name}", data)
     inventory = Inventory.read(job.read("segmentation"), job.read("emission"))
     lamps = {lamp.emitter_id: inventory.name_of(lamp) for lamp in inventory.lamps if lamp.objects}
@@ -65,6 +67,7 @@ def run(job: Job) -> None:
     facts = {
         "up": up.tolist(),
         "parts": len(parts),
+        "meshes": len(taken),
         "faces": sum(len(part.faces) for part in parts),
         "double_sided": [part.name for part in parts if part.double_sided],
         "light_scale": recovered.light_scale,
