@@ -340,8 +340,8 @@ def _geometry(e: Evidence) -> Light:
         [
             _finding(
                 "escape", e.escape, f"{{}} of the rays from surfaces leave the mesh{camera}",
-                "Close the mesh: walls, floor and ceiling reflect light and keep light out. Scan them, or have them built"
-                " by source: {close: box} (docs/guide/own-data.md)", ".1%",
+                "Close the mesh: scan the walls, floor and ceiling that it lacks, because they reflect light and keep light out"
+                " (docs/guide/own-data.md)", ".1%",
             ),
             _finding(
                 "depth", e.depth, "Mesh and measured depth differ by {} (median)",
