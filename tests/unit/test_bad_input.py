@@ -214,8 +214,8 @@ def _(root):
 @case("image in a format not read")
 def _(root):
     document = own.bare(root / "data/own")
-    document["frames"][0]["file_path"] = "images/000.tif"
-    Image.new("RGB", (64, 48)).save(root / "data/own/images/000.tif")
+    document["frames"][0]["file_path"] = "images/000.gif"
+    Image.new("RGB", (64, 48)).save(root / "data/own/images/000.gif")
     own.write_transforms(root / "data/own", document)
     return planned(root)
 

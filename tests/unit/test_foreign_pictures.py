@@ -4,10 +4,12 @@ import json
 import struct
 import unicodedata
 import zlib
+from pathlib import Path
 
 import numpy as np
 import OpenEXR
 import pytest
+import tifffile
 from PIL import Image
 
 from iif_core.numerics.color import linear_from_srgb, srgb_from_linear
@@ -17,6 +19,9 @@ from workflow.intake.names import existing
 from workflow.sources.folder_scene import borders, images, transforms
 from workflow.sources.folder_scene.photographs import decoded
 from workflow.sources.folder_scene.profiles import SPACES
+
+TELEPHONE = Path(__file__).with_name("photograph.heic")
+"""64 x 48 pixels, turned by EXIF: red and green rise by 4 and 5 to the right and down, blue is 128; 1/50 s, ISO 200, f/1.8."""
 
 # -------------------------------------------------------------------------------------------------------- windows of EXR
 
@@ -479,3 +484,80 @@ def test_depth_of_another_shape_is_refused(tmp_path):
     images._header.cache_clear()
     with refused("1.png", "24x24", "64x48", "depth_intrinsics"):
         transforms.read(source, {"views": 9, "dynamic_range": "ldr"})
+
+
+# ---------------------------------------------------------------------------------------------------------- other formats
+
+
+def test_heic_of_a_telephone_is_read_upright():
+    """Its pixels come out turned as they are shown, so that nothing is left to turn."""
+    header = images.header(TELEPHONE)
+    assert (header.size, header.orientation) == ((48, 64), 1)
+    assert header.stated == pytest.approx((200 / 50, 1.8))
+    photo = images.load_photo(TELEPHONE)
+    right, down = np.meshgrid(np.arange(64), np.arange(48))
+    shown = images.TURNS[6](np.stack([4 * right, 5 * down, np.full((48, 64), 128)], -1) / 255)
+    np.testing.assert_allclose(photo.pixels, shown, atol=4 / 255)
+    assert photo.valid.all() and photo.form == ""
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.9])
+def test_heic_that_is_cut_short_is_refused_before_work(tmp_path, kept):
+    data = TELEPHONE.read_bytes()
+    (tmp_path / "a.heic").write_bytes(data[: int(kept * len(data))])
+    with refused("a.heic", "cut short"):
+        images.header(tmp_path / "a.heic")
+
+
+def test_code_points_of_heic_count(monkeypatch):
+    """Those of a file are Rec. 709; read as Display P3, its colours are converted, and PQ is refused."""
+    plain = images.load_photo(TELEPHONE).pixels
+    points = {"color_primaries": 12, "transfer_characteristics": 13}
+    with images.opened(TELEPHONE) as image:
+        kind = type(image)
+    before = kind.__init__
+
+    def stated(self, *facts, **more):
+        before(self, *facts, **more)
+        self.info["nclx_profile"] = dict(points)
+
+    monkeypatch.setattr(kind, "__init__", stated)
+    photo = images.load_photo(TELEPHONE)
+    np.testing.assert_allclose(photo.pixels, SPACES["display_p3"].to_srgb(plain), atol=1e-6)
+    points["transfer_characteristics"] = 16
+    with refused("photograph.heic", "PQ"):
+        images.load_photo(TELEPHONE)
+
+
+@pytest.mark.parametrize("options", [{}, {"compression": "zlib"}, {"planarconfig": "separate"}, {"byteorder": ">"}])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_all_sixteen_bits_of_a_tiff_are_kept(tmp_path, options, channels):
+    values = np.random.default_rng(0).integers(0, 65536, (12, 20, channels), np.uint16)
+    values[..., 3:] = 65535
+    photometric = "minisblack" if channels == 1 else "rgb"
+    planes = channels > 1 and options.get("planarconfig")
+    shown = values[..., 0] if channels == 1 else np.moveaxis(values, -1, 0) if planes else values
+    options = options if channels > 1 or "planarconfig" not in options else {}
+    tifffile.imwrite(tmp_path / "a.tif", shown, photometric=photometric, **options)
+    photo = images.load_photo(tmp_path / "a.tif")
+    expected = np.repeat(values, 3, -1) if channels == 1 else values[..., :3]
+    np.testing.assert_allclose(photo.pixels, expected / 65535, atol=1e-7)
+    assert photo.form == ("16-bit grey" if channels == 1 else "16-bit")
+
+
+@pytest.mark.parametrize("suffix", ["tif", "webp", "bmp", "avif"])
+def test_eight_bits_of_other_formats(tmp_path, suffix):
+    values = np.random.default_rng(0).integers(0, 256, (12, 20, 3), np.uint8)
+    options = {"webp": {"lossless": True}, "avif": {"quality": 100, "subsampling": "4:4:4"}}.get(suffix, {})
+    Image.fromarray(values).save(tmp_path / f"a.{suffix}", **options)
+    photo = images.load_photo(tmp_path / f"a.{suffix}")
+    np.testing.assert_allclose(photo.pixels, values / 255, atol=1e-7 if suffix != "avif" else 4 / 255)
+
+
+@pytest.mark.parametrize("suffix", ["webp", "bmp"])
+def test_other_formats_that_are_cut_short_are_refused_before_work(tmp_path, suffix):
+    path = tmp_path / f"a.{suffix}"
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (12, 20, 3), np.uint8)).save(path)
+    path.write_bytes(path.read_bytes()[:-20])
+    with refused(path.name, "cut short"):
+        images.header(path)

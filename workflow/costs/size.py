@@ -9,8 +9,8 @@ from typing import Any
 
 from workflow import plugins
 from workflow.costs.work import SceneSize
+from workflow.intake.pictures import PHOTOGRAPHS
 
-IMAGES = (".png", ".jpg", ".jpeg", ".exr")
 EXTRAS = {"truth", "masks", "instances", "depth", "predictions"}
 """Folders of a scene whose pictures are not photographs (docs/guide/own-data.md#4-the-folder)."""
 MESHES = (".ply", ".obj", ".glb", ".serialized")
@@ -45,7 +45,7 @@ def estimate(document: dict[str, Any], files: list[Path]) -> SceneSize:
     rendered = plugins.function("SIZES", source["kind"])
     if rendered:
         return SceneSize(capture["views"], float(capture["views"] * box[0] * box[1]), rendered(source, faces))
-    images = [path for path in bytes_ if path.suffix.lower() in IMAGES and not _is_extra(path)]
+    images = [path for path in bytes_ if path.suffix.lower() in PHOTOGRAPHS and not _is_extra(path)]
     views = min(capture["views"], max(len(images), 1))
     width, height = _picture(images[0], box) if images else box
     scale = min(1.0, box[0] / width, box[1] / height)

@@ -13,13 +13,17 @@ from iif_core.errors import InputError
 from workflow.intake import limits
 from workflow.intake.documents import check_file, reading
 
-FORMATS = ("PNG", "JPEG")
+FORMATS = ("PNG", "JPEG", "HEIF", "AVIF", "TIFF", "WEBP", "BMP")
 """Formats of Pillow that photographs may have, whatever their name; Pillow's other readers, such as its PostScript reader, are
-not used. MPO, which telephones write as .jpg, is opened as JPEG."""
-TEXTURES = (*FORMATS, "BMP", "TGA", "PPM")
+not used. MPO, which telephones write as .jpg, is opened as JPEG; HEIF is read by pi-heif."""
+PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".exr", ".heic", ".heif", ".avif", ".tif", ".tiff", ".webp", ".bmp")
+"""Extensions of photographs, and of maps that belong to them."""
+TEXTURES = ("PNG", "JPEG", "BMP", "TGA", "PPM")
 """The same for textures of Mitsuba scenes and of meshes."""
 PNG_MAGIC = b"\x89PNG"
 EXR_MAGIC = b"\x76\x2f\x31\x01"
+_BOXES = b"ftyp"
+"""At the fifth byte of files that consist of boxes, such as HEIF and AVIF."""
 _LARGEST_FILE = 4 << 30
 _LARGEST_CHUNK = 1 << 16
 
@@ -52,6 +56,30 @@ def check_chunks(path: Path) -> None:
                 raise InputError(f"{path}: cut short (no end mark: an interrupted copy or download?); copy the file again")
 
 
+def check_boxes(path: Path) -> None:
+    """Refuse a HEIF or AVIF whose boxes do not end in the file, a WebP or BMP that is shorter than it says."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        start = file.read(16)
+        ends = None
+        if start[:4] == b"RIFF":
+            ends = 8 + int.from_bytes(start[4:8], "little")
+        elif start[:2] == b"BM":
+            ends = int.from_bytes(start[2:6], "little")
+        elif start[4:8] == _BOXES:
+            ends = 0
+            while ends < size:
+                file.seek(ends)
+                head = file.read(16)
+                length = int.from_bytes(head[:4], "big")
+                length = int.from_bytes(head[8:], "big") if length == 1 else length
+                if length == 0:  # up to the end of the file
+                    return
+                ends += max(length, 8)
+    if ends is not None and ends > size:
+        raise InputError(f"{path}: cut short ({size} bytes of {ends}: an interrupted copy or download?); copy the file again")
+
+
 def png_chunk(path: Path, wanted: bytes) -> bytes | None:
     """Return the content of a chunk of a PNG that stands before its pixels; None without one, and of other files."""
     with path.open("rb") as file:
@@ -72,6 +100,11 @@ def opened(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Any]:
 
     check_file(path, _LARGEST_FILE, "a picture")
     check_chunks(path)
+    check_boxes(path)
+    if "HEIF" in formats and _begins_with_boxes(path):
+        import pi_heif
+
+        pi_heif.register_heif_opener()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the size is checked here, against our own limit
         try:
@@ -85,6 +118,11 @@ def opened(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Any]:
         with image:
             check_pixels(path, *image.size)
             yield image
+
+
+def _begins_with_boxes(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(8)[4:] == _BOXES
 
 
 class ExrWindows(NamedTuple):

@@ -15,12 +15,10 @@ from workflow.intake import limits
 from workflow.intake.names import existing, fault_of_name, same_name, shown
 from workflow.sources.folder_scene import images
 
-_HEIC = "Convert all of them: heif-convert <name>.HEIC <name>.jpg, or mogrify -format jpg *.HEIC (ImageMagick)"
 _RAW = "Develop all of them to linear EXR in sRGB primaries (darktable-cli <name>.DNG <name>.exr), or to JPEG"
 CONVERTERS = {
-    **dict.fromkeys((".heic", ".heif", ".avif"), _HEIC),
     **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), _RAW),
-    **dict.fromkeys((".tif", ".tiff", ".webp", ".bmp"), "Convert all of them: mogrify -format png <files> (ImageMagick)"),
+    **dict.fromkeys((".gif", ".jxl", ".jp2"), "Convert all of them: mogrify -format png <files> (ImageMagick)"),
 }
 """What to do with photographs of other formats."""
 

@@ -14,10 +14,10 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.intake.documents import reading
-from workflow.intake.pictures import ExrWindows, exr_chromaticities, exr_windows, opened
+from workflow.intake.pictures import PHOTOGRAPHS, ExrWindows, exr_chromaticities, exr_windows, opened
 from workflow.sources.folder_scene.profiles import SPACES, Space, converted, linear_conversion, of_16_bits
 
-EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr")
+EXTENSIONS = PHOTOGRAPHS
 STRIP_PIXELS = 1 << 20
 """Pixels that are converted or reduced at a time, so that a photograph takes little more memory than its result."""
 MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "I;16", "I;16B", "I")
@@ -148,6 +148,34 @@ def _is_16_bit_png(path: Path) -> bool:
     return start[:4] == b"\x89PNG" and len(start) == 25 and struct.unpack("B", start[24:25])[0] == 16
 
 
+def _png_of_16_bits(path: Path) -> np.ndarray:
+    import mitsuba as mi
+
+    return np.array(mi.Bitmap(str(path)))
+
+
+def _is_16_bit_tiff(path: Path) -> bool:
+    with open(path, "rb") as file:
+        if file.read(4) not in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+            return False
+    import tifffile
+
+    with tifffile.TiffFile(path) as file:
+        return file.pages[0].dtype == np.uint16
+
+
+def _tiff_of_16_bits(path: Path) -> np.ndarray:
+    """Read the first picture of a TIFF, (H, W) or (H, W, C) uint16; Pillow truncates 16-bit colour to 8 bits."""
+    import tifffile
+
+    with tifffile.TiffFile(path) as file:
+        page = file.pages[0]
+        if page.compression not in (1, 5, 8, 32946, 32773):
+            raise InputError(f"{path}: a TIFF of 16 bits, compressed by {page.compression!s}; save it uncompressed or as PNG")
+        pixels = page.asarray()
+    return np.moveaxis(pixels, 0, -1) if page.planarconfig == 2 and pixels.ndim == 3 else pixels
+
+
 def _stored(path: Path) -> np.ndarray:
     """Read the pixels of a png or jpg, (H, W) or (H, W, C), integer, as they are; palettes are resolved."""
     return _pixels_of(path, colour=None)[0]
@@ -163,15 +191,14 @@ def _pixels_of(path: Path, colour: str | None) -> tuple[np.ndarray, str, Space |
     with reading(path, "cannot be read", "; the file is damaged or cut short"):
         given = SPACES.get(colour or "")
         is_srgb = colour == "srgb"
-        if _is_16_bit_png(path):  # Pillow truncates 16-bit colour to 8 bits
-            import mitsuba as mi
-
+        is_tiff = _is_16_bit_tiff(path)
+        if is_tiff or _is_16_bit_png(path):  # Pillow truncates 16-bit colour to 8 bits
             space = given
             if colour == "file":
                 with opened(path) as image:
                     space = of_16_bits(image, path)
             name = "" if space is None or is_srgb else f"in {space.name}"
-            return np.array(mi.Bitmap(str(path))), name, None if is_srgb else space
+            return _tiff_of_16_bits(path) if is_tiff else _png_of_16_bits(path), name, None if is_srgb else space
         with opened(path) as image:
             name = ""
             if image.mode in ("P", "PA"):

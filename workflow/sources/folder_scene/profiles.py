@@ -26,6 +26,8 @@ SAME_GAMMA = 0.03
 _D65 = REC709_PRIMARIES[3]
 _P3 = ((0.68, 0.32), (0.265, 0.69), (0.15, 0.06), _D65)
 _REC2020 = ((0.708, 0.292), (0.17, 0.797), (0.131, 0.046), _D65)
+_REC601 = ((0.63, 0.34), (0.31, 0.595), (0.155, 0.07), _D65)
+_REC601_625 = ((0.64, 0.33), (0.29, 0.60), (0.15, 0.06), _D65)
 _ADOBE = ((0.64, 0.33), (0.21, 0.71), (0.15, 0.06), _D65)
 _AP1 = ((0.713, 0.293), (0.165, 0.83), (0.128, 0.044), (0.32168, 0.33767))
 _ADOBE_GAMMA = 563 / 256
@@ -122,8 +124,8 @@ def stated_space(image: Any, path: Path) -> tuple[Space | None, bool]:
     """Return the colour space that a picture states without an ICC profile, None where that is sRGB, or nothing is stated; and
     whether a profile would not count beside it.
 
-    A PNG states it by its chunks cICP, or without a profile and sRGB by gAMA and cHRM (PNG 3rd edition, 11.3.2); a JPEG of a
-    camera by the interoperability index R03 of EXIF, which is Adobe RGB (DCF 2.0).
+    A HEIF states it by its code points, a PNG by its chunk cICP, or without a profile and sRGB by gAMA and cHRM (PNG 3rd edition,
+    11.3.2); a JPEG of a camera by the interoperability index R03 of EXIF, which is Adobe RGB (DCF 2.0).
 
     Raises:
         InputError: a transfer function or primaries that are not read, such as PQ and HLG.
@@ -134,6 +136,10 @@ def stated_space(image: Any, path: Path) -> tuple[Space | None, bool]:
     info = image.info
     if info.get("icc_profile") or "srgb" in info:
         return None, False
+    coded_heif = info.get("nclx_profile")
+    if coded_heif is not None:
+        points = coded_heif["color_primaries"], coded_heif["transfer_characteristics"]
+        return _by_code_points(path, bytes((*points, 0, 1))), True
     gamma, white_first = info.get("gamma"), info.get("chromaticity")
     if gamma is not None or white_first is not None:
         usual = gamma is None or not 0.05 < gamma < 20 or abs(gamma - 1 / 2.2) <= SAME_GAMMA
@@ -152,7 +158,7 @@ def stated_space(image: Any, path: Path) -> tuple[Space | None, bool]:
     return (SPACES["adobe_rgb"] if str(index).startswith("R03") else None), False
 
 
-_CODED_PRIMARIES = {1: REC709_PRIMARIES, 2: REC709_PRIMARIES, 9: _REC2020, 12: _P3}
+_CODED_PRIMARIES = {1: REC709_PRIMARIES, 2: REC709_PRIMARIES, 5: _REC601_625, 6: _REC601, 7: _REC601, 9: _REC2020, 12: _P3}
 _CODED_CURVES = {
     **dict.fromkeys((2, 13), linear_from_srgb),
     **dict.fromkeys((1, 6, 14, 15), _from_video),
@@ -163,16 +169,17 @@ _CODED_CURVES = {
 
 
 def _by_code_points(path: Path, coded: bytes) -> Space | None:
-    """Colour space of a chunk cICP: numbers of ITU-T H.273 for primaries and transfer function, then matrix and range."""
+    """Colour space of code points, such as a chunk cICP: numbers of ITU-T H.273 for primaries and transfer function, then matrix
+    and range."""
     again = "save it as linear EXR, or in sRGB"
     if len(coded) != 4 or coded[2] != 0 or coded[3] != 1:
-        raise InputError(f"{path}: chunk cICP {coded[:8].hex()}: no full-range RGB; {again}")
+        raise InputError(f"{path}: code points {coded[:8].hex()}: no full-range RGB; {again}")
     if coded[0] not in _CODED_PRIMARIES or coded[1] not in _CODED_CURVES:
         what = {16: " (PQ)", 18: " (HLG)"}.get(coded[1], "")
         raise InputError(
             f"{path}: its colours have primaries {coded[0]} and the curve {coded[1]}{what} of H.273, not read; {again}"
         )
-    space = Space("the colours that its chunk cICP states", _CODED_PRIMARIES[coded[0]], _CODED_CURVES[coded[1]])
+    space = Space("the colours that its code points state", _CODED_PRIMARIES[coded[0]], _CODED_CURVES[coded[1]])
     return None if space.light is linear_from_srgb and space.matrix is None else space
 
 
