@@ -6,7 +6,9 @@ everything that it can depend on.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from workflow import plugins
 
@@ -27,6 +29,7 @@ class Stage:
         scores: whether it compares or shows the result, and so may read held-out photographs and ground truth.
         place: name of its module where that is not `workflow.stages.<name>`.
         threads: cores that its job takes, unless a profile says otherwise.
+        also: kind of source -> stages that it reads too in scenes of that kind.
     """
 
     name: str
@@ -40,6 +43,11 @@ class Stage:
     scores: bool = False
     place: str = ""
     threads: int = 2
+    also: tuple[tuple[str, tuple[str, ...]], ...] = ()
+
+    def reads(self, document: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return the stages that it reads in a scene with these settings."""
+        return (*self.upstream, *dict(self.also).get(document["source"]["kind"], ()))
 
     @property
     def module(self) -> str:
@@ -69,11 +77,21 @@ STAGES: dict[str, Stage] = {
     stage.name: stage
     for stage in (
         Stage(
+            "reconstruction",
+            "Find the cameras of photographs, and a mesh; of scenes that have nothing else.",
+            (),
+            ("source",),
+            reads_raw=True,
+            on_demand=True,
+            files=("workflow.sources.photographs",),
+        ),
+        Stage(
             "capture",
             "Bring photographs, cameras and mesh into the normal form, or render them.",
             (),
             ("source", "capture", "seed"),
             reads_raw=True,
+            also=(("photographs", ("reconstruction",)),),
         ),
         Stage(
             "plan",

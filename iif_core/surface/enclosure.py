@@ -19,6 +19,7 @@ LEAST = 0.02
 BEYOND = 0.01
 """Largest share of the area that may lie behind a plane that bounds the room: what was scanned through a window."""
 _BINS = 32  # of normals, along each axis
+_SHIFTS, _FITS = 8, 6
 _DIRECTIONS = 24  # of planes that are looked at, the largest first
 
 
@@ -40,7 +41,13 @@ class Enclosure(NamedTuple):
 
 
 def enclosure(
-    vertices: ArrayLike, faces: ArrayLike, within: ArrayLike, kind: Literal["box", "planes"], margin: float = 0.02
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    within: ArrayLike,
+    kind: Literal["box", "planes"],
+    margin: float = 0.02,
+    beyond: float = BEYOND,
+    noise: float = 0.0,
 ) -> Enclosure:
     """Build the closed surface around a scan.
 
@@ -52,35 +59,67 @@ def enclosure(
         within: (k, 3) points that are inside, at least one: cameras.
         kind: which of the two.
         margin: distance (m) of the sides behind what they close, so that walls of the scan stay in front.
+        beyond: largest share of the area that may lie behind a plane that bounds the room.
+        noise: share of the area that is left out at each end of the extent; 0 = the extent of all vertices.
 
     Returns:
-        The surface. It contains all points, and the scan but for what lies behind its planes (at most `BEYOND` of the area each).
+        The surface. It contains all points, and the scan but for what lies behind its planes and for noise.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
     within = np.asarray(within, np.float64).reshape(-1, 3)
     normal, area = face_geometry(vertices, faces)
-    directions = _directions(normal, area)
+    axes_found = directions(normal, area)
 
-    # -------- six sides along the axes of the room, at the extent of everything --------
-    axes = _right_angled(directions)
-    outward = np.concatenate([axes, -axes])
-    bound = np.maximum((vertices[np.unique(faces)] @ outward.T).max(0), (within @ outward.T).max(0))
+    middle = vertices[faces].mean(1)
 
     # -------- planes of the scan that have nearly all of it, and every camera, on one side --------
     found = np.zeros((0, 4))
     if kind == "planes":
-        middle = vertices[faces].mean(1)
-        signed = [sign * direction for direction in directions for sign in (1.0, -1.0)]
-        at = [_bounding(middle @ n, np.abs(normal @ n) >= ALIKE, area, float((within @ n).max())) for n in signed]
-        found = np.array([[*n, d] for n, d in zip(signed, at, strict=True) if d is not None]).reshape(-1, 4)
-        lacking = (outward @ found[:, :3].T < ALIKE).all(1)
-        outward, bound = outward[lacking], bound[lacking]
+        signed = [sign * direction for direction in axes_found for sign in (1.0, -1.0)]
+        planes = [_bounding(n, middle, normal, area, within, beyond) for n in signed]
+        found = np.array([plane for plane in planes if plane is not None]).reshape(-1, 4)
+        axes_found = np.concatenate([found[:, :3], axes_found])  # a plane tells its direction better than normals do
+
+    # -------- sides along the axes of the room where there is none, at the extent of everything --------
+    axes = _right_angled(axes_found)
+    outward = np.concatenate([axes, -axes])
+    outward = outward[(outward @ found[:, :3].T < ALIKE).all(1)]
+    extent = [_end(middle @ n, area, noise) if noise > 0 else (vertices[np.unique(faces)] @ n).max() for n in outward]
+    bound = np.maximum(extent, (within @ outward.T).max(0)) if len(outward) else np.zeros(0)
 
     both = np.concatenate([found[:, :3], outward]), np.concatenate([found[:, 3], bound]) + margin
     return _polyhedron(*both, np.arange(len(both[0])) < len(found), within.mean(0))
 
 
-def _directions(normal: NDArray, area: NDArray) -> NDArray:
+def fitted_plane(
+    outward: NDArray, own: NDArray, middle: NDArray, normal: NDArray, area: NDArray, beside: float = BESIDE
+) -> tuple[NDArray, NDArray]:
+    """Fit a plane to faces by least squares, and again to those beside it, as their normals alone would not tell it.
+
+    Args:
+        outward: (3,) unit, about the direction.
+        own: (m,) bool, the faces to begin with.
+        middle, normal, area: (m, 3), (m, 3) and (m,) of all faces.
+        beside: largest distance of a face from the plane.
+
+    Returns:
+        The direction (3,), and (m,) bool: the faces that are of the plane.
+    """
+    for _ in range(_FITS):
+        if not area[own].sum() > 0:
+            break
+        centre = np.average(middle[own], axis=0, weights=area[own])
+        apart = middle[own] - centre
+        axis = np.linalg.eigh((apart * area[own, None]).T @ apart)[1][:, 0]
+        axis = axis if axis @ outward > 0 else -axis
+        if axis @ outward < ALIKE:  # too little surface to tell
+            break
+        outward = axis
+        own = (np.abs(normal @ outward) >= ALIKE) & (np.abs((middle - centre) @ outward) <= beside)
+    return outward, own
+
+
+def directions(normal: NDArray, area: NDArray) -> NDArray:
     """Return directions (k, 3) that much of the area faces, whichever way round, the largest first."""
     # Normals become the means of bins of a few degrees; a face and one that is turned over are of the same.
     turned = np.where(_first_sign(normal)[:, None] < 0, -normal, normal)
@@ -92,15 +131,15 @@ def _directions(normal: NDArray, area: NDArray) -> NDArray:
     found, left = [], weight.copy()
     while len(found) < _DIRECTIONS:
         seeds = np.argsort(-left, kind="stable")[:64]
-        near = np.abs(axis[seeds] @ axis.T) >= ALIKE
-        best = int(np.argmax(near @ left))
-        if left[near[best]].sum() < LEAST * weight.sum() and found:
+        mean = axis[seeds[np.argmax((np.abs(axis[seeds] @ axis.T) >= ALIKE) @ left)]]
+        for _ in range(_SHIFTS):  # to the middle of what is there; the mean of axes is the eigenvector of their moments
+            near = np.abs(axis @ mean) >= ALIKE
+            mean = np.linalg.eigh((axis[near] * left[near, None]).T @ axis[near])[1][:, -1]
+        near = np.abs(axis @ mean) >= ALIKE
+        if left[near].sum() < LEAST * weight.sum() and found:
             break
-        # The mean of an axis is the eigenvector of its moments.
-        one = axis[near[best]]
-        mean = np.linalg.eigh((one * left[near[best], None]).T @ one)[1][:, -1]
         found.append(mean * (_first_sign(mean[None])[0] or 1.0))
-        left[near[best]] = 0.0
+        left[near] = 0.0
         if not left.any():
             break
     return np.array(found)
@@ -110,6 +149,13 @@ def _first_sign(vector: NDArray) -> NDArray:
     """Return the sign (n,) of the first component of vectors (n, 3) that is not small."""
     large = np.abs(vector) > 0.5 / _BINS
     return np.sign(np.take_along_axis(vector, large.argmax(1)[:, None], 1)[:, 0])
+
+
+def _end(place: NDArray, area: NDArray, noise: float) -> float:
+    """Return the place beyond which a share `noise` of the area lies."""
+    order = np.argsort(place)
+    share = np.cumsum(area[order]) / area.sum()
+    return float(place[order][min(np.searchsorted(share, 1.0 - noise), len(order) - 1)])
 
 
 def _right_angled(directions: NDArray) -> NDArray:
@@ -122,27 +168,31 @@ def _right_angled(directions: NDArray) -> NDArray:
     return np.stack([first, second, np.cross(first, second)])
 
 
-def _bounding(place: NDArray, faces_it: NDArray, area: NDArray, least: float) -> float | None:
-    """Return where the outermost plane of one direction lies, None = there is none that bounds the room.
+def _bounding(
+    outward: NDArray, middle: NDArray, normal: NDArray, area: NDArray, within: NDArray, beyond: float
+) -> NDArray | None:
+    """Return the outermost plane of one direction (4,): n and d with n . x = d at its outer border; None = none bounds the room.
 
     Args:
-        place: (m,) of each face along the direction.
-        faces_it: (m,) bool, the face is square to the direction.
-        area: (m,).
-        least: place of the outermost camera.
+        outward: (3,) unit.
+        middle, normal, area: (m, 3), (m, 3) and (m,) of the faces.
+        within: (k, 3) points that must be inside.
+        beyond: largest share of the area behind the plane.
     """
-    low = place.min()
-    layer = ((place - low) / BESIDE).astype(np.int64)
+    place, faces_it = middle @ outward, np.abs(normal @ outward) >= ALIKE
+    layer = ((place - place.min()) / BESIDE).astype(np.int64)
     own, every = np.bincount(layer, area * faces_it, layer.max() + 2), np.bincount(layer, area, layer.max() + 2)
     behind = np.append(np.cumsum(every[::-1])[::-1], 0.0)
     # A plane may lie across the border of two layers.
     two = own[:-1] + own[1:]
-    fits = (two >= LEAST * area.sum()) & (behind[2 : len(two) + 2] <= BEYOND * area.sum())
+    fits = (two >= LEAST * area.sum()) & (behind[2 : len(two) + 2] <= beyond * area.sum())
     for k in np.flatnonzero(fits)[::-1]:
-        of_plane = faces_it & (layer >= k) & (layer <= k + 1)
-        at = float(place[of_plane].max())
-        if at >= least:
-            return at
+        better, of_plane = fitted_plane(outward, faces_it & (layer >= k) & (layer <= k + 1), middle, normal, area)
+        if not of_plane.any():
+            continue
+        at = float((middle[of_plane] @ better).max())
+        if at >= (within @ better).max():
+            return np.append(better, at)
     return None
 
 

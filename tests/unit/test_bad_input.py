@@ -1118,6 +1118,6 @@ def test_every_example_of_the_guide_is_valid():
     guide, programs = ((PAGE.parents[2] / f"docs/guide/{name}.md").read_text() for name in ("own-data", "programs"))
     examples = re.findall(r"```yaml\n(.*?)```", guide + programs, re.DOTALL)
     kinds = {settings.SceneSettings.model_validate(yaml.safe_load(text)).source.kind for text in examples}
-    assert kinds == {"folder", "scannetpp", "fipt"}
+    assert kinds == {"folder", "photographs", "scannetpp", "fipt"}
     matrix = json.loads(re.search(r"```json\n(.*?)```", guide, re.DOTALL)[1])["frames"][0]["transform_matrix"]
     assert np.linalg.det(np.array(matrix)[:3, :3]) == pytest.approx(1, abs=0.02)

@@ -18,6 +18,7 @@ UNSHIPPED = re.compile(r"\b[A-Z]{6,} (?:\d+\.\d+|H\d+)\b|\bH\d{1,2}\b")  # secti
 PAGE_OF_LETTER = {
     "R": "reflectance",
     "C": "camera",
+    "D": "reconstruction",
     "P": "priors",
     "N": "plan",
     "O": "objects",

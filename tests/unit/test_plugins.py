@@ -106,7 +106,7 @@ def test_without_plug_ins_an_unknown_kind_is_refused_with_those_that_exist(pytho
     (tmp_path / "config/scenes/room.yaml").write_text("source: {kind: extra}\n")
     said = python("from workflow.settings import load; load('room')", folder=tmp_path)
     assert said.returncode and "InputError: config/scenes/room.yaml: `source.kind`" in said.stderr
-    assert "'extra'" in said.stderr and "folder, scannetpp, fipt" in said.stderr
+    assert "'extra'" in said.stderr and "folder, photographs, scannetpp, fipt" in said.stderr
     assert good(python("from workflow.settings import load; print(load('room').source.kind)", "tests.extra_names", tmp_path))
 
 

@@ -93,7 +93,7 @@ def test_scene_over_preset_over_default(scene):
         ("source: {kind: builtin}\nprior: {kind: simulated, samples: 0}\n", ["prior.samples", 0, 1]),
         (
             "source: {kind: buildin}\nprior: {kind: simulated}\n",
-            ["source.kind", "'buildin'", "folder, scannetpp, fipt, builtin, drawn, mitsuba"],
+            ["source.kind", "'buildin'", "folder, photographs, scannetpp, fipt, builtin, drawn, mitsuba"],
         ),
         ("source: {kind: builtin}\nprior: {samples: 30}\n", ["prior.samples", 30, 16]),
         ("source: {kind: mitsuba}\nprior: {kind: simulated}\n", ["source.path", "config/scenes/kitchen.yaml"]),

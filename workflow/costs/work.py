@@ -207,7 +207,12 @@ def _publish(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, 
     return "all", {"pixels": size.pixels / MILLION, "faces": size.faces / MILLION}
 
 
+def _reconstruction(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    return "photographs", {"views": size.views / 100}
+
+
 _STAGES = {
+    "reconstruction": _reconstruction,
     "capture": _capture,
     "plan": _plan,
     "prior": _prior,

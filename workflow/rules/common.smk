@@ -124,7 +124,7 @@ def reads(stage, more=None):
         faults = or_stop(batch_table.check_stage, stage, scene, quality_of(scene))
         again_if_unsound(target, f"{scene}: stage {stage} is made again", faults)
         common, one = derived_scenes.shared_scene(scene), STAGES[stage]
-        found = {name: manifest(name, scene) for name in one.upstream}
+        found = {name: manifest(name, scene) for name in one.reads(resolved(scene))}
         found |= {f"{SHARED}{name}": manifest(name, common) for name in one.shared}
         return found | (more(scene) if more else {})
 

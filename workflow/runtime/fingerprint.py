@@ -260,7 +260,7 @@ def fingerprint(stage: str, scene: str, quality: str) -> str:
         "settings": settings_module.recorded(document, settings_of(stage, document)),
         "code": code_digest(stage, document),
         "raw": raw,
-        "upstream": {up: fingerprint(up, scene, quality) for up in STAGES[stage].upstream},
+        "upstream": {up: fingerprint(up, scene, quality) for up in STAGES[stage].reads(document)},
     }
     if STAGES[stage].shared:
         shared = derived.shared_scene(scene)

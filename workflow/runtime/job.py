@@ -148,7 +148,7 @@ class Job:
         Raises:
             InputError: the stage is not there, or was built under other settings or code.
         """
-        if stage not in self.stage.upstream:
+        if stage not in self.stage.reads(self.document):
             raise AssertionError(f"stage {self.stage.name} reads {stage}, which registry.py does not list as upstream")
         return self._reader(stage, self.scene)
 
@@ -185,7 +185,7 @@ class Job:
         return StageWriter(self._scenes.directory(self.stage.name, self.scene), self._provenance())
 
     def _provenance(self) -> dict[str, Any]:
-        readers = {stage: self.read(stage) for stage in self.stage.upstream}
+        readers = {stage: self.read(stage) for stage in self.stage.reads(self.document)}
         readers |= {f"{SHARED}{stage}": self.read_shared(stage) for stage in self.stage.shared}
         inputs = {
             name: {

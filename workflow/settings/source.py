@@ -85,6 +85,23 @@ class FolderSource(PhotographedSource):
     """Keep only images whose file path matches this glob pattern."""
 
 
+class PhotographsSource(PhotographedSource):
+    """Photographs and nothing else: cameras and mesh are found from them (docs/guide/programs.md#photographs-alone)."""
+
+    kind: Literal["photographs"]
+    path: Path
+    """Folder of the photographs; those in its folders count too."""
+    most: int = Field(120, ge=3, le=2000)
+    """Largest number of photographs whose cameras are found, evenly spread by name; of those, `capture.views` are used for
+    materials."""
+    room_height: float | None = Field(None, gt=0.5, lt=50)
+    """Metres from floor to ceiling, which give the scale."""
+    camera_height: float = Field(1.5, gt=0.05, lt=20)
+    """Metres above the floor at which the cameras are held (median); a guess of the scale where `room_height` is not given."""
+    detail: int = Field(480, ge=64, le=4096)
+    """Pixels along the longer side of the depth maps of which the mesh is made. Time goes with its cube."""
+
+
 class ScanNetppSource(PhotographedSource):
     """A scene of ScanNet++ as released: `dslr/` and `scans/` in one folder (docs/guide/own-data.md)."""
 
@@ -110,7 +127,7 @@ class FiptSource(PhotographedSource):
 
 
 Source = Annotated[
-    plugins.union("source", FolderSource, ScanNetppSource, FiptSource),
+    plugins.union("source", FolderSource, PhotographsSource, ScanNetppSource, FiptSource),
     Field(discriminator="kind"),
 ]
 

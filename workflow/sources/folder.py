@@ -372,7 +372,9 @@ def _checked_alignment(task: _Task, taken: _Taken) -> list[str]:
     pairs = list(zip(taken.frames, taken.views, strict=True))
     message = taken.aligned.refuse(path, tolerance, lambda: _better_depth(task, pairs))
     alignment.raise_or_note(message, mode, out)
-    warning, better = taken.aligned.edge_warning(tolerance), ""
+    # Points by which the cameras themselves were found say more than edges, of which a mesh made from photographs has few.
+    by_points = task.inputs.cameras.known and len(taken.aligned.ratios) > 0
+    warning, better = "" if by_points else taken.aligned.edge_warning(tolerance), ""
     if warning and not taken.aligned.ratios:
         better = _better_edges(task, taken.trials, taken.aligned.report()["edge_correlation"])
     if better:

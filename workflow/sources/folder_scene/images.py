@@ -102,6 +102,22 @@ def _header(path: Path, _stamp: tuple[int, int]) -> Header:
     return found
 
 
+def exif_upright(path: Path) -> tuple[bytes, tuple[str, float]]:
+    """Return the EXIF of a photograph that was turned upright, and what it says of the camera: its model, and the focal length as
+    that of 35 mm film (else in mm, 0 = not stated)."""
+    if path.suffix.lower() == ".exr":
+        return b"", ("", 0.0)
+    with reading(path, "not a readable image"), opened(path) as image:
+        exif = image.getexif()
+        exif[274] = 1
+        own = exif.get_ifd(_PHOTO_IFD)
+        try:
+            focal = float(own.get(41989) or own.get(37386) or 0.0)
+        except (TypeError, ValueError, ZeroDivisionError):
+            focal = 0.0
+        return exif.tobytes(), (str(exif.get(272, ""))[:100], focal if np.isfinite(focal) else 0.0)
+
+
 def _stated_exposure(photo: Mapping[int, Any]) -> Stated | None:
     """Exposure by the tags of a photograph; None if time or speed is missing, or a tag is no number that a camera could have."""
     values: list[float | None] = []

@@ -109,7 +109,8 @@ def _cameras(folder: Path, source: dict[str, Any], capture: dict[str, Any], poin
         return apps.frames_of(app, folder, source, capture), apps.MESHES[app]
     raise InputError(
         f"{folder}: neither transforms.json nor a COLMAP model, nor cameras of another program that is known"
-        f" (docs/guide/programs.md); a `folder` scene needs one of them.{_hint(folder)}"
+        " (docs/guide/programs.md); a `folder` scene needs one of them, a scene of photographs alone has"
+        f" `source: {{kind: photographs}}`.{_hint(folder)}"
     )
 
 

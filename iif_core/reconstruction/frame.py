@@ -1,0 +1,98 @@
+"""The frame of a room that photographs alone do not tell: which way is up, where the floor lies, and how long a metre is."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from iif_core.surface.enclosure import directions, fitted_plane
+from iif_core.surface.triangles import face_geometry
+
+UPRIGHT = float(np.cos(np.radians(25.0)))
+"""Cosine of the largest angle between the vertical of the surface and that of the cameras."""
+LEVEL = 0.9
+"""Cosine with the vertical from which a face is level."""
+BESIDE_FLOOR = 0.03
+"""Share of the height of the room by which faces of the floor lie apart."""
+NOISE = 0.005
+"""Share of the level surface below the floor, and above the ceiling: depth that is wrong."""
+LEAST = 0.005
+"""Least share of the area that makes a floor or a ceiling."""
+BINS = 90
+"""Layers in which the height of the room is divided."""
+
+
+class RoomFrame(NamedTuple):
+    """Where a reconstruction lies.
+
+    Attributes:
+        turn: (3, 3) rotation to z up, x along the largest wall.
+        floor, ceiling: heights along the new z, before any scaling.
+        has_floor, has_ceiling: level surface lies there; else surface ends there.
+    """
+
+    turn: NDArray
+    floor: float
+    ceiling: float
+    has_floor: bool
+    has_ceiling: bool
+
+
+def room_frame(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLike) -> RoomFrame:
+    """Find the vertical, the direction of the walls, and the heights of floor and ceiling.
+
+    The vertical is the direction that much surface faces and that is nearest to the mean vertical of the cameras; without one, it
+    is that of the cameras. Floor and ceiling are the heights where most of the level surface lies near the ends.
+
+    Args:
+        vertices, faces: (n, 3) and (m, 3), in any unit.
+        world_from_camera: (v, 3 or 4, 4) poses, OpenCV axes.
+    """
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+    normal, area = face_geometry(vertices, faces)
+    up = -np.asarray(world_from_camera, np.float64)[:, :3, 1].mean(0)
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    found = directions(normal, area)
+    nearest = found[np.abs(found @ up).argmax()]
+    if abs(nearest @ up) >= UPRIGHT:
+        up = nearest * np.sign(nearest @ up)
+    middle = vertices[faces].mean(1)
+
+    # -------- the floor tells the vertical best --------
+    level = np.abs(normal @ up) > LEVEL
+    beside = BESIDE_FLOOR * float(np.ptp(middle @ up))
+    floor = _ends(middle @ up, area, level)[0]
+    up, _ = fitted_plane(up, level & (np.abs(middle @ up - floor) <= beside), middle, normal, area, beside)
+
+    # -------- walls: the largest direction that is square to it --------
+    upright = found[np.abs(found @ up) < np.sqrt(1 - UPRIGHT**2)]
+    along = upright[0] if len(upright) else np.eye(3)[np.abs(up).argmin()]
+    along = along - (along @ up) * up
+    along /= np.linalg.norm(along)
+    return RoomFrame(np.stack([along, np.cross(up, along), up]), *_ends(middle @ up, area, np.abs(normal @ up) > LEVEL))
+
+
+def _ends(height: NDArray, area: NDArray, level: NDArray) -> tuple[float, float, bool, bool]:
+    """Return where most level surface lies in the lowest and in the highest third of the room, else where all surface ends; and
+    whether there is such surface.
+
+    Args:
+        height, area: (m,) of the faces.
+        level: (m,) bool.
+    """
+    order = np.argsort(height)
+    share = np.cumsum(area[order]) / area.sum()
+    low, high = (float(height[order][min(np.searchsorted(share, s), len(order) - 1)]) for s in (NOISE, 1 - NOISE))
+    step = max((high - low) / BINS, 1e-12)
+    place = np.clip(((height - low) / step).astype(np.int64), 0, BINS - 1)
+    filled = np.convolve(np.bincount(place, area * level, BINS), np.ones(3), "same")
+    third = BINS // 3
+    out, there = [], []
+    for first, end in ((0, low), (BINS - third, high)):
+        peak = first + int(filled[first : first + third].argmax())
+        own = (np.abs(place - peak) <= 1) & level
+        there.append(bool(area[own].sum() >= LEAST * area.sum()))
+        out.append(float(np.average(height[own], weights=area[own])) if there[-1] else end)
+    return out[0], out[1], there[0], there[1]

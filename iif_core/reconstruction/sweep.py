@@ -1,0 +1,326 @@
+"""Depth of a photograph by plane sweep: which of many planes in front of it makes others look like it, smoothly over the picture.
+
+Cost by zero-mean normalised cross-correlation, which exposures do not change; aggregation after Hirschmueller (2008).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iif_core.numerics.compiled import njit
+
+UNKNOWN = 255
+"""Cost of a plane on which too few other photographs show a pixel."""
+_SCALE = 127.0  # levels of cost for a correlation of 0
+
+
+class Picture(NamedTuple):
+    """A photograph without distortion.
+
+    Attributes:
+        grey: (H, W) float32.
+        intrinsics: (3, 3), pixel centres at half-integers.
+        camera_from_world: (3, 4) rotation and translation, OpenCV axes.
+    """
+
+    grey: NDArray
+    intrinsics: NDArray
+    camera_from_world: NDArray
+
+    @property
+    def centre(self) -> NDArray:
+        rotation, translation = self.camera_from_world[:, :3], self.camera_from_world[:, 3]
+        return -rotation.T @ translation
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """How depth is searched.
+
+    Attributes:
+        planes: number of depths, evenly spread in inverse depth.
+        radius: of the windows that are compared, pixels.
+        least: how many of the other photographs must show a pixel; the mean of the best `least` costs counts, so that one in
+            which it is hidden does not.
+        step, jump: costs of a change of depth by one plane and by more between neighbours, in levels of cost (127 =
+            uncorrelated).
+        edge: difference of grey between neighbours that halves `jump`.
+    """
+
+    planes: int = 96
+    radius: int = 3
+    least: int = 2
+    step: float = 12.0
+    jump: float = 120.0
+    edge: float = 0.2
+
+
+def swept_depth(
+    reference: Picture, others: Sequence[Picture], near: float, far: float, options: SweepOptions = SweepOptions()
+) -> NDArray:
+    """Return the z-depth (H, W) float32 of a photograph, NaN where fewer than `least` others show a pixel, in the world's unit.
+
+    Args:
+        reference: whose depth it is.
+        others: to compare it with.
+        near, far: least and largest depth.
+    """
+    inverse = np.linspace(1.0 / far, 1.0 / near, options.planes)
+    maps = np.stack([_homographies(reference, other, inverse) for other in others])
+    grey = np.ascontiguousarray(reference.grey, np.float32)
+    cost = _costs(grey, tuple(np.ascontiguousarray(o.grey, np.float32) for o in others), maps, options)
+    total = np.zeros(cost.shape, np.uint16)
+    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
+        _add_path(cost, grey, dy, dx, options.step, options.jump, options.edge, total)
+    place = _best(total, cost)
+    with np.errstate(divide="ignore"):
+        return (1.0 / np.interp(place, np.arange(options.planes), inverse)).astype(np.float32)
+
+
+def _homographies(reference: Picture, other: Picture, inverse: NDArray) -> NDArray:
+    """(planes, 3, 3) float64: pixel of the reference -> pixel of the other, by the planes z = 1 / inverse of the reference
+    (Eq. D.1).
+    """
+    rotation, translation = reference.camera_from_world[:, :3], reference.camera_from_world[:, 3]
+    turn = other.camera_from_world[:, :3] @ rotation.T
+    move = other.camera_from_world[:, 3] - turn @ translation
+    plane = np.outer(move, [0.0, 0.0, 1.0])
+    return other.intrinsics @ (turn + inverse[:, None, None] * plane) @ np.linalg.inv(reference.intrinsics)
+
+
+def _costs(grey: NDArray, others: tuple[NDArray, ...], maps: NDArray, options: SweepOptions) -> NDArray:
+    """(H, W, planes) uint8 costs."""
+    height, width = grey.shape
+    cost = np.full((height, width, options.planes), UNKNOWN, np.uint8)
+    mean, square = np.empty_like(grey), np.empty_like(grey)
+    lines = np.empty_like(grey)
+    _box(grey, options.radius, lines, mean)
+    _box(grey * grey, options.radius, lines, square)
+    deviation = np.sqrt(np.maximum(square - mean * mean, 0.0)).astype(np.float32)
+    scores = np.empty((len(others), height, width), np.float32)
+    for plane in range(options.planes):
+        for number, other in enumerate(others):
+            _correlate(grey, mean, deviation, other, maps[number, plane], options.radius, scores[number])
+        _merge(scores, options.least, plane, cost)
+    return cost
+
+
+@njit(fastmath=False)
+def _box(values: NDArray, radius: int, lines: NDArray, out: NDArray) -> None:
+    """Means (H, W) of windows of 2 radius + 1 pixels; at the border of those that exist."""
+    height, width = values.shape
+    for y in range(height):
+        total = 0.0
+        for x in range(min(radius, width)):
+            total += values[y, x]
+        for x in range(width):
+            if x + radius < width:
+                total += values[y, x + radius]
+            if x - radius - 1 >= 0:
+                total -= values[y, x - radius - 1]
+            lines[y, x] = total / (min(x + radius, width - 1) - max(x - radius, 0) + 1)
+    for x in range(width):
+        total = 0.0
+        for y in range(min(radius, height)):
+            total += lines[y, x]
+        for y in range(height):
+            if y + radius < height:
+                total += lines[y + radius, x]
+            if y - radius - 1 >= 0:
+                total -= lines[y - radius - 1, x]
+            out[y, x] = total / (min(y + radius, height - 1) - max(y - radius, 0) + 1)
+
+
+@njit()
+def _correlate(
+    grey: NDArray, mean: NDArray, deviation: NDArray, other: NDArray, homography: NDArray, radius: int, score: NDArray
+) -> None:
+    """Correlation (H, W) of each window with what another photograph shows on one plane; -2 where it does not show all of it."""
+    height, width = grey.shape
+    rows, columns = other.shape
+    warped = np.empty((height, width), np.float32)
+    known = np.empty((height, width), np.float32)
+    h = homography
+
+    # -------- what the other photograph shows on the plane, between its pixels --------
+    for y in range(height):
+        for x in range(width):
+            u, v = x + 0.5, y + 0.5
+            w = h[2, 0] * u + h[2, 1] * v + h[2, 2]
+            known[y, x] = 0.0
+            warped[y, x] = 0.0
+            if w <= 1e-9:
+                continue
+            px = (h[0, 0] * u + h[0, 1] * v + h[0, 2]) / w - 0.5
+            py = (h[1, 0] * u + h[1, 1] * v + h[1, 2]) / w - 0.5
+            if px < 0.0 or py < 0.0 or px > columns - 1.001 or py > rows - 1.001:
+                continue
+            i, j = int(py), int(px)
+            a, b = py - i, px - j
+            warped[y, x] = (other[i, j] * (1 - b) + other[i, j + 1] * b) * (1 - a) + (
+                other[i + 1, j] * (1 - b) + other[i + 1, j + 1] * b
+            ) * a
+            known[y, x] = 1.0
+
+    # -------- moments over windows: sums over columns that go down with the rows, and over them along each row --------
+    of_column = np.zeros((4, width))
+    for y in range(-radius, height):
+        first, last = y - radius - 1, y + radius
+        if last < height:
+            for x in range(width):
+                value = warped[last, x]
+                of_column[0, x] += value
+                of_column[1, x] += value * value
+                of_column[2, x] += value * grey[last, x]
+                of_column[3, x] += known[last, x]
+        if first >= 0:
+            for x in range(width):
+                value = warped[first, x]
+                of_column[0, x] -= value
+                of_column[1, x] -= value * value
+                of_column[2, x] -= value * grey[first, x]
+                of_column[3, x] -= known[first, x]
+        if y < 0:
+            continue
+        rows_in = min(y + radius, height - 1) - max(first, -1)
+        own = square = both = whole = 0.0
+        for x in range(-radius, width):
+            if x + radius < width:
+                own += of_column[0, x + radius]
+                square += of_column[1, x + radius]
+                both += of_column[2, x + radius]
+                whole += of_column[3, x + radius]
+            if x - radius - 1 >= 0:
+                own -= of_column[0, x - radius - 1]
+                square -= of_column[1, x - radius - 1]
+                both -= of_column[2, x - radius - 1]
+                whole -= of_column[3, x - radius - 1]
+            if x < 0:
+                continue
+            count = rows_in * (min(x + radius, width - 1) - max(x - radius - 1, -1))
+            if whole < count - 0.5:
+                score[y, x] = -2.0
+                continue
+            middle = own / count
+            spread = np.sqrt(max(square / count - middle * middle, 0.0))
+            # A window without texture correlates with nothing; noise of 1 % counts as none.
+            below = max(spread, 0.01) * max(deviation[y, x], 0.01)
+            score[y, x] = min(max((both / count - middle * mean[y, x]) / below, -1.0), 1.0)
+
+
+@njit()
+def _merge(scores: NDArray, least: int, plane: int, cost: NDArray) -> None:
+    """Write the cost of one plane: of the mean of the best `least` correlations."""
+    count, height, width = scores.shape
+    best = np.empty(least, np.float32)
+    for y in range(height):
+        for x in range(width):
+            for k in range(least):
+                best[k] = -2.0
+            for s in range(count):
+                value = scores[s, y, x]
+                for k in range(least):
+                    if value > best[k]:
+                        for m in range(least - 1, k, -1):
+                            best[m] = best[m - 1]
+                        best[k] = value
+                        break
+            if best[least - 1] < -1.5:
+                continue
+            total = 0.0
+            for k in range(least):
+                total += best[k]
+            cost[y, x, plane] = np.uint8(min(round(127.0 * (1.0 - total / least)), 254))
+
+
+@njit()
+def _add_path(cost: NDArray, grey: NDArray, dy: int, dx: int, step: float, jump: float, edge: float, total: NDArray) -> None:
+    """Add the least costs of all ways that come to each pixel in one direction (Eq. D.2)."""
+    height, width, planes = cost.shape
+    last = np.zeros((width, planes), np.float32)
+    lines = np.zeros((width, planes), np.float32)
+    least_of_last, least_of_line = np.zeros(width, np.float32), np.zeros(width, np.float32)
+    for row in range(height):
+        y = row if dy >= 0 else height - 1 - row
+        for column in range(width):
+            x = column if dx >= 0 else width - 1 - column
+            py, px = y - dy, x - dx
+            starts = py < 0 or py >= height or px < 0 or px >= width
+            if dy == 0 and not starts:
+                before, floor = lines[px], least_of_line[px]
+            else:
+                before, floor = last[px if not starts else x], least_of_last[px if not starts else x]
+            own = lines[x]
+            limit = jump
+            if not starts:
+                limit = max(jump / (1.0 + abs(grey[y, x] - grey[py, px]) / edge), step)
+            lowest = 1e30
+            for d in range(planes):
+                value = np.float32(cost[y, x, d]) if cost[y, x, d] != 255 else np.float32(127.0)
+                if not starts:
+                    reach = min(before[d], floor + limit)
+                    if d > 0:
+                        reach = min(reach, before[d - 1] + step)
+                    if d < planes - 1:
+                        reach = min(reach, before[d + 1] + step)
+                    value += reach - floor
+                own[d] = value
+                lowest = min(lowest, value)
+                total[y, x, d] += np.uint16(value)
+            least_of_line[x] = lowest
+        if dy != 0:
+            last[:] = lines
+            least_of_last[:] = least_of_line
+
+
+@njit()
+def _best(total: NDArray, cost: NDArray) -> NDArray:
+    """(H, W) float64 place of the least total cost, between planes by a parabola; NaN where no plane is known."""
+    height, width, planes = total.shape
+    out = np.full((height, width), np.nan)
+    for y in range(height):
+        for x in range(width):
+            at = 0
+            for d in range(planes):
+                if total[y, x, d] < total[y, x, at]:
+                    at = d
+            if cost[y, x, at] == 255 or at == 0 or at == planes - 1:
+                continue
+            before, here, after = float(total[y, x, at - 1]), float(total[y, x, at]), float(total[y, x, at + 1])
+            bend = before - 2 * here + after
+            out[y, x] = at + (0.5 * (before - after) / bend if bend > 0 else 0.0)
+    return out
+
+
+def agreed(
+    depth: NDArray, reference: Picture, others: Sequence[tuple[NDArray, Picture]], tolerance: float = 0.015, least: int = 1
+) -> NDArray:
+    """Return the depth (H, W) where at least `least` other depth maps have the same surface, NaN elsewhere.
+
+    Args:
+        depth: z-depth of the reference, NaN = unknown.
+        others: depth maps with their pictures.
+        tolerance: largest relative difference of depths.
+        least: number of maps that must agree.
+    """
+    height, width = depth.shape
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(reference.intrinsics).T
+    camera = reference.camera_from_world
+    points = (rays * depth[..., None] - camera[:, 3]) @ camera[:, :3]
+    count = np.zeros(depth.shape, np.int64)
+    for other, picture in others:
+        local = points @ picture.camera_from_world[:, :3].T + picture.camera_from_world[:, 3]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            shown = local @ picture.intrinsics.T
+            x, y = shown[..., 0] / shown[..., 2], shown[..., 1] / shown[..., 2]
+            inside = (local[..., 2] > 0) & (x >= 0) & (y >= 0) & (x < other.shape[1]) & (y < other.shape[0])
+        i, j = (np.where(inside, a, 0).astype(np.int64) for a in (y, x))
+        with np.errstate(invalid="ignore"):
+            count += inside & (np.abs(other[i, j] - local[..., 2]) <= tolerance * local[..., 2])
+    return np.where(count >= least, depth, np.nan).astype(np.float32)

@@ -1,0 +1,127 @@
+"""Flat walls, floor and ceiling where depth maps found nothing, because a wall without texture looks the same everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iif_core.reconstruction.sweep import Picture
+from iif_core.surface.closest import closest_points
+from iif_core.surface.enclosure import BESIDE, Enclosure, enclosure
+from iif_core.surface.triangles import face_geometry
+
+TILE = 0.1
+"""Edge (m) of the squares of which walls are made."""
+NEAR = 0.06
+"""Distance (m) from the mesh up to which a tile is there already."""
+THROUGH = 0.05
+"""Share by which a depth map must look beyond a tile to say that nothing is there."""
+
+
+BEYOND = 0.05
+"""Largest share of the area behind a wall: depth that is wrong."""
+
+NOISE = 0.005
+"""Share of the area at each end of the room that is such depth."""
+
+
+class Walls(NamedTuple):
+    """Surface that closes a room.
+
+    Attributes:
+        vertices: (n, 3); faces: (m, 3) int64, normals inward.
+        side: (m,) int64, row of `sides` of each face.
+        sides: the planes.
+        error: (s,) root mean square distance (m) of the mesh from each side that prolongs a plane of it, NaN for others.
+    """
+
+    vertices: NDArray
+    faces: NDArray
+    side: NDArray
+    sides: Enclosure
+    error: NDArray
+
+
+def missing_walls(vertices: NDArray, faces: NDArray, depths: Sequence[NDArray], pictures: Sequence[Picture]) -> Walls:
+    """Return what a mesh lacks of the planes around it.
+
+    The planes are those of `enclosure`. A square of a plane is built where no surface is near, and no depth map shows anything
+    behind it, as through a door.
+
+    Args:
+        vertices, faces: (n, 3), metres, and (m, 3), with an area.
+        depths: (H, W) z-depth of each picture, NaN = unknown.
+        pictures: their cameras.
+    """
+    centres = np.array([picture.centre for picture in pictures])
+    sides = enclosure(vertices, faces, centres, "planes", margin=0.0, beyond=BEYOND, noise=NOISE)
+    normal, area = face_geometry(vertices, faces)
+    middle = vertices[faces].mean(1)
+    corners, tiles, of_side, error = [], [], [], np.full(len(sides.normal), np.nan)
+    for number, inward in enumerate(sides.normal):
+        outline = sides.vertices[np.unique(sides.faces[sides.side == number])]
+        offset = float(outline.mean(0) @ inward)
+        # A plane lies in the middle of the surface that it prolongs, not at its border.
+        if sides.from_plane[number]:
+            away = middle @ inward - offset
+            own = (np.abs(normal @ inward) > 0.9) & (np.abs(away) < BESIDE)
+            shift = float(np.average(away[own], weights=area[own])) if area[own].sum() > 0 else 0.0
+            error[number] = np.sqrt(np.average((away[own] - shift) ** 2, weights=area[own])) if area[own].sum() > 0 else np.nan
+            outline = outline + shift * inward
+        grid, quads = _tiles(outline, inward)
+        tiles.append(quads + sum(map(len, corners)))
+        corners.append(grid)
+        of_side.append(np.full(len(quads), number))
+    points, quads, side = np.concatenate(corners), np.concatenate(tiles), np.concatenate(of_side)
+    centre = points[quads].mean(1)
+    away = np.linalg.norm(closest_points(vertices, faces, centre).points - centre, axis=1)
+    kept = (away > NEAR) & ~_seen_through(centre, depths, pictures)
+    quads, side = quads[kept], side[kept]
+    used, local = np.unique(quads, return_inverse=True)
+    local = local.reshape(-1, 4)
+    both = np.concatenate([local[:, [0, 1, 2]], local[:, [0, 2, 3]]])
+    return Walls(points[used], both, np.concatenate([side, side]), sides, error)
+
+
+def _tiles(outline: NDArray, inward: NDArray) -> tuple[NDArray, NDArray]:
+    """Corners (n, 3) and squares (m, 4) of about `TILE` that fill a convex outline (k, 3), seen from the side of `inward`."""
+    u = np.cross(inward, np.eye(3)[np.abs(inward).argmin()])
+    u /= np.linalg.norm(u)
+    # Along the longest edge of the outline.
+    middle = outline.mean(0)
+    flat = np.column_stack([(outline - middle) @ u, (outline - middle) @ np.cross(inward, u)])
+    order = np.argsort(np.arctan2(flat[:, 1], flat[:, 0]))
+    edges = np.roll(outline[order], -1, 0) - outline[order]
+    u = edges[np.linalg.norm(edges, axis=1).argmax()]
+    u /= np.linalg.norm(u)
+    v = np.cross(inward, u)
+    flat = np.column_stack([(outline - middle) @ u, (outline - middle) @ v])[order]
+    low, high = flat.min(0), flat.max(0)
+    count = np.maximum(np.ceil((high - low) / TILE).astype(int), 1)
+    a, b = (np.linspace(low[i], high[i], count[i] + 1) for i in range(2))
+    grid = np.stack(np.meshgrid(a, b, indexing="ij"), -1).reshape(-1, 2)
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(count[0]), np.arange(count[1]), indexing="ij"))
+    first = i * (count[1] + 1) + j
+    quads = np.stack([first, first + count[1] + 1, first + count[1] + 2, first + 1], 1)
+    inner = grid[quads].mean(1)
+    along = np.roll(flat, -1, 0) - flat
+    turn = along[None, :, 0] * (inner[:, None, 1] - flat[None, :, 1]) - along[None, :, 1] * (inner[:, None, 0] - flat[None, :, 0])
+    return middle + grid[:, :1] * u + grid[:, 1:] * v, quads[(turn >= -1e-9).all(1)]
+
+
+def _seen_through(points: NDArray, depths: Sequence[NDArray], pictures: Sequence[Picture]) -> NDArray:
+    """(n,) bool: at least two depth maps show something well behind a point."""
+    count = np.zeros(len(points), np.int64)
+    for depth, picture in zip(depths, pictures, strict=True):
+        local = points @ picture.camera_from_world[:, :3].T + picture.camera_from_world[:, 3]
+        shown = local @ picture.intrinsics.T
+        with np.errstate(invalid="ignore", divide="ignore"):
+            x, y = shown[:, 0] / shown[:, 2], shown[:, 1] / shown[:, 2]
+            inside = (local[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < depth.shape[1]) & (y < depth.shape[0])
+        j, i = (np.where(inside, k, 0).astype(np.int64) for k in (x, y))
+        with np.errstate(invalid="ignore"):
+            count += inside & (depth[i, j] > (1 + THROUGH) * local[:, 2] + NEAR)
+    return count >= 2

@@ -1,0 +1,165 @@
+"""Cameras are known here: depth by plane sweep, what several agree on, the mesh of it, walls and the frame of the room."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from iif_core.reconstruction.frame import room_frame
+from iif_core.reconstruction.fusing import fused_mesh, large_pieces
+from iif_core.reconstruction.neighbours import neighbours
+from iif_core.reconstruction.sweep import Picture, SweepOptions, agreed, swept_depth
+from iif_core.reconstruction.walls import missing_walls
+from iif_core.surface.triangles import face_geometry
+from tests.unit.test_enclosure import room
+
+WIDTH, HEIGHT, FOCAL = 96, 72, 80.0
+INTRINSICS = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1.0]])
+TEXTURE = gaussian_filter(np.random.default_rng(0).normal(size=(800, 800)), 2.0, mode="wrap")
+TEXTURE = 0.5 + 0.15 * TEXTURE / TEXTURE.std()
+SLOPE = np.array([0.15, -0.1, 1.0])  # the wall: SLOPE . x = 3
+
+
+def depth_on(pose, normal=SLOPE, offset=3.0):
+    """z-depth (H, W) of a plane normal . x = offset seen from a pose (3, 4) camera_from_world, and its points."""
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(INTRINSICS).T
+    centre = -pose[:, :3].T @ pose[:, 3]
+    world = rays @ pose[:, :3]
+    depth = (offset - centre @ normal) / (world @ normal)
+    return depth, centre + depth[..., None] * world
+
+
+def photograph(pose, gain=1.0, **plane):
+    """The textured wall, one texel a centimetre."""
+    _, points = depth_on(pose, **plane)
+    fine = (points[..., :2] / 0.01) - np.floor(points[..., :2] / 0.01)
+    i, j = np.floor(points[..., 0] / 0.01).astype(int), np.floor(points[..., 1] / 0.01).astype(int)
+    a, b = fine[..., 0], fine[..., 1]
+    corner = lambda di, dj: TEXTURE[(i + di) % 800, (j + dj) % 800]  # noqa: E731
+    shown = (1 - a) * ((1 - b) * corner(0, 0) + b * corner(0, 1)) + a * ((1 - b) * corner(1, 0) + b * corner(1, 1))
+    return Picture((gain * shown).astype(np.float32), INTRINSICS, pose)
+
+
+def pose_at(x, y, turn=0.0):
+    rotation = Rotation.from_euler("y", turn).as_matrix()
+    return np.column_stack([rotation, -rotation @ [x, y, 0.0]])
+
+
+POSES = [pose_at(0, 0), pose_at(0.3, 0.05, 0.08), pose_at(-0.3, 0.0, -0.08), pose_at(0.05, 0.25, 0.02)]
+
+
+def test_depth_of_a_slanted_wall_between_exposures():
+    """Other photographs are up to twice as bright; depth is right to a quarter of a plane; one alone tells nothing."""
+    pictures = [photograph(pose, gain) for pose, gain in zip(POSES, (1.0, 1.5, 0.7, 2.0), strict=True)]
+    options = SweepOptions(planes=64)
+    found = swept_depth(pictures[0], pictures[1:], 1.5, 6.0, options)
+    truth, _ = depth_on(POSES[0])
+    inner = np.s_[8:-8, 8:-8]
+    step = (1 / 1.5 - 1 / 6.0) / 63
+    error = np.abs(1 / found - 1 / truth)[inner]
+    assert np.isfinite(found[inner]).mean() > 0.97
+    assert np.nanmedian(error) < 0.25 * step and np.nanquantile(error, 0.95) < step
+    one = swept_depth(pictures[0], pictures[1:2], 1.5, 6.0, options)
+    assert not np.isfinite(one).any()
+
+
+def test_a_camera_somewhere_else_tells_nothing():
+    behind = np.column_stack([Rotation.from_euler("y", np.pi).as_matrix(), [0.0, 0.0, 0.0]])
+    away = [Picture(photograph(POSES[0]).grey, INTRINSICS, behind)] * 2
+    assert not np.isfinite(swept_depth(photograph(POSES[0]), away, 1.5, 6.0, SweepOptions(planes=16))).any()
+
+
+def test_depth_on_which_others_do_not_agree_is_dropped():
+    pictures = [photograph(pose) for pose in POSES]
+    depths = [depth_on(pose)[0].astype(np.float32) for pose in POSES]
+    spoilt = depths[0].copy()
+    spoilt[20:30, 40:50] *= 1.1
+    kept = agreed(spoilt, pictures[0], list(zip(depths[1:], pictures[1:], strict=True)), least=2)
+    assert np.isnan(kept[20:30, 40:50]).all()
+    inner = np.ones(kept.shape, bool)
+    inner[20:30, 40:50] = False
+    inner[:8], inner[-8:], inner[:, :16], inner[:, -16:] = False, False, False, False
+    assert np.isfinite(kept[inner]).all()
+    unknown = np.full_like(spoilt, np.nan)
+    assert np.isnan(agreed(spoilt, pictures[0], [(unknown, pictures[1])], least=1)).all()
+
+
+def test_neighbours_show_the_same_from_a_little_aside():
+    """Cameras on a line look at points 4 m away; 0.56 m aside is 8 degrees. The last one shows other points."""
+    centres = np.array([[x, 0.0, 0.0] for x in (0.0, 0.05, 0.56, 1.1, 3.0)] + [[0.5, 0, 0]])
+    points = np.column_stack([np.linspace(-0.2, 0.2, 20), np.zeros(20), np.full(20, 4.0)])
+    points = np.concatenate([points, points + [0, 0, 3.0]])
+    view = np.repeat(np.arange(6), 20)
+    point = np.concatenate([np.arange(20)] * 5 + [np.arange(20, 40)])
+    found = neighbours(point, view, points, centres, most=3)
+    assert found[0].tolist()[0] == 2 and 1 not in found[0].tolist()[:2]
+    assert len(found[5]) == 0 and all(5 not in own for own in found)
+
+
+def test_a_mesh_of_depth_maps_lies_on_the_wall():
+    pictures = [photograph(pose) for pose in POSES]
+    depths = [depth_on(pose)[0].astype(np.float32) for pose in POSES]
+    vertices, faces = fused_mesh(depths, pictures, 0.04)
+    distance = np.abs(vertices @ SLOPE - 3.0) / np.linalg.norm(SLOPE)
+    assert np.median(distance) < 0.005 and distance.max() < 0.08
+    normal, area = face_geometry(vertices, faces)
+    towards = -SLOPE / np.linalg.norm(SLOPE)
+    assert np.average(normal @ towards, weights=area) > 0.98
+    assert not len(fused_mesh([np.full((HEIGHT, WIDTH), np.nan, np.float32)], pictures[:1], 0.04)[1])
+
+
+def test_small_loose_pieces_are_left_out():
+    vertices, faces = room(((2, 1),))
+    far = np.array([[9.0, 0, 0], [9.02, 0, 0], [9.0, 0.02, 0]])
+    kept = large_pieces(np.concatenate([vertices, far]), np.concatenate([faces, [[0, 1, 2]] + np.array(len(vertices))]))
+    assert len(kept[1]) == len(faces) and kept[0][:, 0].max() < 3
+
+
+def looking(eye, at):
+    from iif_core.camera.pinhole import look_at
+
+    return np.linalg.inv(look_at(eye, at, (0, 0, 1)))[:3]
+
+
+def test_walls_without_texture_are_built_and_doors_stay_open():
+    """Of a wall of the room nothing was found but its ends; two cameras look out through a door in another."""
+    vertices, faces = room()
+    middle = vertices[faces].mean(1)
+    gone = (middle[:, 0] > 2.49) & (np.abs(middle[:, 1]) < 1.4)
+    door = (middle[:, 1] < -1.99) & (np.abs(middle[:, 0]) < 0.45) & (middle[:, 2] < 0.75)
+    pictures, depths = [], []
+    for x in (-0.4, 0.4):
+        pose = looking((x, 1.5, 0.0), (0.0, -2.0, -0.2))
+        pictures.append(Picture(np.zeros((HEIGHT, WIDTH), np.float32), INTRINSICS, pose))
+        depth = np.full((HEIGHT, WIDTH), np.nan, np.float32)
+        _, points = depth_on(pose, normal=np.array([0.0, -1.0, 0.0]), offset=2.0)
+        through = (np.abs(points[..., 0]) < 0.45) & (points[..., 2] < 0.75)
+        depth[through] = 9.0
+        depths.append(depth)
+    built = missing_walls(vertices, faces[~(gone | door)], depths, pictures)
+    centre = built.vertices[built.faces].mean(1)
+    normal, area = face_geometry(built.vertices, built.faces)
+    of_wall, of_door = np.abs(centre[:, 0] - 2.5) < 0.02, np.abs(centre[:, 1] + 2.0) < 0.02
+    assert area[of_wall].sum() == pytest.approx(2.8 * 2.5, rel=0.15)
+    assert (normal[of_wall] @ [-1.0, 0, 0] > 0.999).all()
+    assert area[of_door].sum() < 0.1 * 0.9 * 2.0
+    assert (of_wall | of_door).mean() > 0.99
+    assert np.nanmax(built.error) < 1e-3 and built.sides.from_plane.all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_frame_of_a_room_is_found_whichever_way_it_lies(seed):
+    vertices, faces = room(((1, 1),))
+    turn = Rotation.random(random_state=seed).as_matrix()
+    eyes = [(-1.0, 0.5, 0.2), (1.0, -0.5, 0.3), (0.3, 1.0, 0.1)]
+    poses = np.array([np.linalg.inv(np.vstack([looking(eye, (0.2, 0.1, -0.5)), [0, 0, 0, 1]])) for eye in eyes])
+    moved = np.eye(4)
+    moved[:3, :3], moved[:3, 3] = turn, [3.0, -8.0, 1.0]
+    frame = room_frame(vertices @ turn.T + moved[:3, 3], faces, moved @ poses)
+    own = (vertices @ turn.T + moved[:3, 3]) @ frame.turn.T
+    assert np.linalg.det(frame.turn) == pytest.approx(1.0)
+    np.testing.assert_allclose(np.sort(np.ptp(own, axis=0)), [2.5, 4.0, 5.0], atol=1e-3)
+    assert np.ptp(own[:, 2]) == pytest.approx(2.5, abs=1e-3)  # z is up
+    assert (frame.turn @ turn @ [0, 0, 1])[2] > 0.999
+    assert frame.ceiling - frame.floor == pytest.approx(2.5, abs=0.02)

@@ -1,0 +1,1 @@
+"""Cameras and a mesh from photographs alone (docs/method/reconstruction.md)."""

@@ -1,0 +1,224 @@
+"""Cameras of photographs by COLMAP's incremental structure from motion, through pycolmap, on the CPU."""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from iif_core.camera.distortion import Distortion, Pinhole, undistort_image
+from iif_core.errors import InputError
+from iif_core.numerics.color import key_exposure, tone_map
+from iif_core.reconstruction.sweep import Picture
+from workflow.sources.folder_scene import images
+
+LONGEST = 1600
+"""Pixels along the longer side at which photographs are compared; features of more are hardly placed better."""
+FEATURES = 4096
+"""Largest number of a photograph."""
+EVERY_PAIR = 150
+"""Photographs up to which each is compared with each; of more, each with those next to it in the order of their names."""
+BESIDE = 20
+LEAST, LEAST_SHARE = 3, 0.5
+"""Photographs that must hang together, and share of all."""
+_SEED = 0
+
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Sparse:
+    """Cameras that were found, and the points by which they were.
+
+    Attributes:
+        names: (v) of the photographs.
+        pinholes, radial: (v) cameras at the full size of the upright photographs, and k1 of their lenses.
+        camera_from_world: (v, 3, 4) OpenCV axes, in a frame and unit of their own.
+        points: (p, 3).
+        point, view: (n,) observations.
+        left_out: name -> why it has no camera.
+    """
+
+    names: list[str]
+    pinholes: list[Pinhole]
+    radial: np.ndarray
+    camera_from_world: np.ndarray
+    points: np.ndarray
+    point: np.ndarray
+    view: np.ndarray
+    left_out: dict[str, str]
+
+    @property
+    def world_from_camera(self) -> np.ndarray:
+        """(v, 4, 4)."""
+        rotation = self.camera_from_world[:, :, :3].transpose(0, 2, 1)
+        out = np.tile(np.eye(4), (len(self.names), 1, 1))
+        out[:, :3, :3] = rotation
+        out[:, :3, 3] = -np.einsum("vij,vj->vi", rotation, self.camera_from_world[:, :, 3])
+        return out
+
+    def without(self, gone: Sequence[int], why: str) -> Sparse:
+        """Return the same without some views."""
+        kept = np.setdiff1d(np.arange(len(self.names)), np.asarray(gone, np.int64))
+        number = np.full(len(self.names), -1)
+        number[kept] = np.arange(len(kept))
+        own = number[self.view] >= 0
+        return replace(
+            self,
+            names=[self.names[i] for i in kept],
+            pinholes=[self.pinholes[i] for i in kept],
+            radial=self.radial[kept],
+            camera_from_world=self.camera_from_world[kept],
+            point=self.point[own],
+            view=number[self.view][own],
+            left_out=self.left_out | {self.names[i]: why for i in gone},
+        )
+
+    def placed(self, turn: np.ndarray, shift: np.ndarray, scale: float) -> Sparse:
+        """Return the same in the frame x' = scale (turn x + shift)."""
+        rotation = self.camera_from_world[:, :, :3] @ turn.T
+        centre = (self.world_from_camera[:, :3, 3] @ turn.T + shift) * scale
+        moved = np.concatenate([rotation, -np.einsum("vij,vj->vi", rotation, centre)[..., None]], -1)
+        return replace(self, camera_from_world=moved, points=(self.points @ turn.T + shift) * scale)
+
+
+def find_cameras(root: Path, names: Sequence[str], threads: int, colour: str, progress: Progress) -> Sparse:
+    """Find the cameras of photographs.
+
+    Args:
+        root: folder that the names count from.
+        names: of the photographs. Those of one size, model of camera and focal length by EXIF are of one camera.
+        threads: that may be used.
+        colour: `source.colour`.
+        progress: called with what is done, of how many, and what it is.
+
+    Raises:
+        InputError: too few hang together.
+    """
+    import pycolmap
+
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
+    with tempfile.TemporaryDirectory(prefix="iif-") as folder:
+        work, database, cameras = Path(folder) / "images", Path(folder) / "database.db", Counter()
+        sizes = []
+        for number, name in enumerate(names):
+            sizes.append(_working_copy(root / name, work, number, cameras, colour))
+            progress(number + 1, len(names), "photographs read")
+        pycolmap.set_random_seed(_SEED)
+        _compare(database, work, len(names), threads, progress)
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads = 1  # sums of several threads differ from run to run
+        options.random_seed = _SEED
+        (Path(folder) / "sparse").mkdir()
+        found = pycolmap.incremental_mapping(database, work, Path(folder) / "sparse", options)
+    most = max(found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()), default=None)
+    count = 0 if most is None else most.num_reg_images()
+    least = max(LEAST, int(np.ceil(LEAST_SHARE * len(names))))
+    if most is None or count < least:
+        raise InputError(
+            f"{root}: {count} of {len(names)} photographs hang together; at least {least} must. Take more of them, each of which"
+            " shows most of what another shows, from another place (not only turned), sharp, and of things with texture"
+            " (docs/guide/programs.md#photographs-alone)"
+        )
+    return _plain(most, names, sizes)
+
+
+def _compare(database: Path, work: Path, count: int, threads: int, progress: Progress) -> None:
+    """Find features and matches of the working copies, into COLMAP's database."""
+    import pycolmap
+
+    cpu = pycolmap.Device.cpu
+    extraction, matching, reader = (
+        pycolmap.FeatureExtractionOptions(),
+        pycolmap.FeatureMatchingOptions(),
+        pycolmap.ImageReaderOptions(),
+    )
+    extraction.num_threads = matching.num_threads = threads
+    extraction.sift.max_num_features = FEATURES
+    reader.camera_model = "SIMPLE_RADIAL"
+    by_folder = pycolmap.CameraMode.PER_FOLDER
+    progress(0, count, "features")
+    pycolmap.extract_features(
+        database, work, camera_mode=by_folder, reader_options=reader, extraction_options=extraction, device=cpu
+    )
+    progress(0, count, "photographs compared")
+    if count <= EVERY_PAIR:
+        pycolmap.match_exhaustive(database, matching_options=matching, device=cpu)
+    else:
+        pairing = pycolmap.SequentialPairingOptions()
+        pairing.overlap = BESIDE
+        pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing, device=cpu)
+    progress(0, count, "cameras placed")
+
+
+def _plain(model: Any, names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> Sparse:
+    """Return what COLMAP found as arrays, with cameras at the size (width, height) of the photographs."""
+    number = {key: i for i, key in enumerate(sorted(model.points3D))}
+    points = np.array([model.points3D[key].xyz for key in number]).reshape(-1, 3)
+    posed = sorted((int(Path(image.name).stem), image) for image in model.images.values() if image.has_pose)
+    pinholes, radial, poses, point, view = [], [], [], [], []
+    for own, (place, image) in enumerate(posed):
+        camera, (width, height) = model.cameras[image.camera_id], sizes[place]
+        sx, sy = width / camera.width, height / camera.height
+        focal, cx, cy, k1 = (float(value) for value in camera.params)
+        pinholes.append(Pinhole(focal * sx, focal * sy, cx * sx, cy * sy, width, height))
+        radial.append(k1)
+        poses.append(image.cam_from_world().matrix())
+        seen = [number[p.point3D_id] for p in image.points2D if p.has_point3D()]
+        point += seen
+        view += [own] * len(seen)
+    there = {place for place, _ in posed}
+    left_out = {name: "shares too little with the others" for i, name in enumerate(names) if i not in there}
+    return Sparse(
+        [names[place] for place, _ in posed],
+        pinholes,
+        np.array(radial),
+        np.array(poses, np.float64),
+        points,
+        np.array(point, np.int64),
+        np.array(view, np.int64),
+        left_out,
+    )
+
+
+def _working_copy(path: Path, work: Path, number: int, cameras: Counter[Any], colour: str) -> tuple[int, int]:
+    """Write a photograph upright, in sRGB and reduced, into a folder for its camera, with its EXIF, by which COLMAP knows the
+    focal length; return the size (width, height) of the whole."""
+    header = images.header(path)
+    photo = images.load_photo(path, header.orientation, colour=colour)
+    height, width = photo.valid.shape
+    picture = _shown(path, photo, *images.fitted_size(width, height, LONGEST, LONGEST))
+    exif, lens = images.exif_upright(path)
+    key = (width, height, lens)
+    folder = work / f"{list(cameras).index(key) if key in cameras else len(cameras):03d}"
+    cameras[key] += 1
+    folder.mkdir(parents=True, exist_ok=True)
+    levels = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+    Image.fromarray(levels).save(folder / f"{number:06d}.jpg", quality=95, subsampling=0, exif=exif)
+    return width, height
+
+
+def _shown(path: Path, photo: images.Photo, width: int, height: int) -> np.ndarray:
+    """(height, width, 3) sensor values of a photograph, or tone-mapped radiance."""
+    reduced, valid = images.reduce_area(photo.pixels, photo.valid, width, height)
+    return tone_map(reduced, key_exposure(reduced, valid)) if path.suffix.lower() == ".exr" else reduced
+
+
+def picture_of(root: Path, sparse: Sparse, view: int, longest: int, colour: str) -> Picture:
+    """Return a photograph in grey, without distortion, reduced to `longest` pixels, with its camera."""
+    path, full = root / sparse.names[view], sparse.pinholes[view]
+    photo = images.load_photo(path, images.header(path).orientation, colour=colour)
+    width, height = images.fitted_size(full.width, full.height, longest, longest)
+    grey = _shown(path, photo, width, height).mean(-1, keepdims=True).astype(np.float32)
+    sx, sy = width / full.width, height / full.height
+    camera = Pinhole(full.fx * sx, full.fy * sy, full.cx * sx, full.cy * sy, width, height)
+    if sparse.radial[view]:
+        grey, _ = undistort_image(grey, Distortion("radial_tangential", (sparse.radial[view], 0.0, 0.0, 0.0)), camera, camera)
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    return Picture(np.ascontiguousarray(grey[..., 0], np.float32), matrix, sparse.camera_from_world[view])

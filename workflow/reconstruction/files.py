@@ -1,0 +1,71 @@
+"""What stage reconstruction writes for people and for the capture: cameras, mesh, a picture of both."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Sequence
+
+import numpy as np
+
+from iif_core.reconstruction.sweep import Picture
+from iif_core.reconstruction.walls import Walls
+from workflow.reconstruction.cameras import Sparse
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+SHOWN = 6  # depth maps in the picture
+_DOTS = 30_000
+
+
+def transforms_json(sparse: Sparse) -> bytes:
+    """Return transforms.json of nerfstudio, with OpenGL axes, pixel centres at half-integers and a camera for each photograph."""
+    frames = []
+    for name, camera, k1, pose in zip(sparse.names, sparse.pinholes, sparse.radial, sparse.world_from_camera, strict=True):
+        own = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+        frames.append({"file_path": name, **own, "k1": float(k1), "transform_matrix": (pose @ OPENGL).tolist()})
+    document = {"camera_model": "OPENCV", "pixel_centres_at": "half", "frames": frames}
+    return (json.dumps(document, indent=1) + "\n").encode()
+
+
+def ply_bytes(vertices: np.ndarray, faces: np.ndarray) -> bytes:
+    """Return a binary PLY of a mesh."""
+    rows = np.zeros(len(faces), np.dtype([("count", "u1"), ("corner", "<i4", 3)]))
+    rows["count"], rows["corner"] = 3, faces
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property float {name}" for name in "xyz"]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    return "\n".join(header).encode() + np.ascontiguousarray(vertices, "<f4").tobytes() + rows.tobytes()
+
+
+def overview_png(
+    sparse: Sparse, vertices: np.ndarray, walls: Walls, pictures: Sequence[Picture], depths: Sequence[np.ndarray]
+) -> bytes:
+    """Draw the plan and a side view of mesh, added walls and cameras, and photographs beside their depth."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 9), layout="constrained")
+    FigureCanvasAgg(figure)
+    above, below = figure.subfigures(2, 1, height_ratios=(3, 2))
+    centre, ahead = sparse.world_from_camera[:, :3, 3], sparse.world_from_camera[:, :3, 2]
+    dots = vertices[:: max(1, len(vertices) // _DOTS)]
+    added = walls.vertices[:: max(1, len(walls.vertices) // _DOTS)]
+    for axes, (i, j), title in zip(above.subplots(1, 2), ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
+        axes.plot(added[:, i], added[:, j], ".", ms=1.5, color="tab:orange", alpha=0.4, label="added wall")
+        axes.plot(dots[:, i], dots[:, j], ",", color="0.4", label="surface that photographs show")
+        axes.quiver(centre[:, i], centre[:, j], ahead[:, i], ahead[:, j], color="tab:blue", width=0.003, label="camera")
+        axes.set(aspect="equal", xlabel=f"{'xyz'[i]} (m)", ylabel=f"{'xyz'[j]} (m)", title=title)
+    above.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    shown = np.unique(np.linspace(0, len(pictures) - 1, SHOWN).round().astype(int))
+    rows = below.subplots(2, len(shown), squeeze=False)
+    far = float(np.nanquantile(np.concatenate([z[::4, ::4].ravel() for z in depths]), 0.98))
+    for column, view in enumerate(shown):
+        rows[0, column].imshow(pictures[view].grey, cmap="gray", vmin=0, vmax=1)
+        rows[0, column].set_title(sparse.names[view][-24:], fontsize=8)
+        drawn = rows[1, column].imshow(depths[view], cmap="viridis", vmin=0, vmax=far)
+        for axes in rows[:, column]:
+            axes.set_axis_off()
+    below.colorbar(drawn, ax=rows[1, :], label="depth that others confirm (m)")
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=110, metadata={"Software": None})
+    return out.getvalue()
