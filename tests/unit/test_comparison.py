@@ -7,11 +7,13 @@ import pytest
 from PIL import Image
 
 from iif_core.numerics.color import srgb_from_linear
+from iif_core.reflectance.material import CHANNELS
 from lab.studies.grid import Line, draw
 from tests.errors import refused
 from workflow.artifacts.files import write_exr
 from workflow.artifacts.store import split_rgb
 from workflow.comparison import maps as foreign
+from workflow.comparison import pair
 from workflow.comparison.named import digest_of_maps
 from workflow.comparison.pair import _numbers, _words
 
@@ -137,3 +139,38 @@ def test_a_sheet_has_a_picture_for_each_method_and_keeps_their_places(tmp_path):
         x, y = int(width * (box.x0 + 0.1 * box.width)), int(height * (1 - box.y1 + 0.1 * box.height))
         assert image[y, x].argmax() == tint and image[y, x].max() == 255
     assert {"ground truth", "ours", "room\nalbedo"} <= {text.get_text() for text in figure.texts}
+
+
+def result_of(names, values, faces="same"):
+    """A result with two objects of two cells each, as `compare` reads it."""
+    cells = {"object_id": np.array([0, 0, 1, 1])}
+    fitted = {channel: np.repeat(values, 2).astype(np.float32) for channel in CHANNELS}
+    table = {"object_id": np.array([0, 1]), "name": np.array(names)}
+    segmentation = SimpleNamespace(table=lambda name: table, manifest={"files": {"faces.parquet": {"sha256": faces}}})
+    return {
+        "base": SimpleNamespace(table=lambda name: cells),
+        "affines": SimpleNamespace(table=lambda name: fitted),
+        "segmentation": segmentation,
+    }
+
+
+def test_the_same_pieces_are_compared_whatever_their_colour_is_called():
+    first, second = pair._objects(
+        result_of(["white wall", "red top"], [0.5, 0.2]), result_of(["beige wall", "red top"], [0.4, 0.3])
+    )
+    assert first.keys() == second.keys() and len(first) == 2 * len(CHANNELS)
+    assert (first["0 white wall/roughness"], second["0 white wall/roughness"]) == pytest.approx((0.5, 0.4))
+    first, second = pair._objects(
+        result_of(["white wall", "red top"], [0.5, 0.2]), result_of(["beige wall", "red top"], [0.4, 0.3], "other")
+    )
+    assert set(first) & set(second) == {f"1 red top/{channel}" for channel in CHANNELS}
+
+
+def test_photographs_are_paired_by_name_although_their_poses_were_corrected(monkeypatch):
+    def capture(*views):
+        return {"capture": [SimpleNamespace(name=name, world_from_camera=np.eye(4) + x * np.eye(4, k=3)) for name, x in views]}
+
+    monkeypatch.setattr(pair, "CaptureReader", lambda views: SimpleNamespace(views=views))
+    a = capture(("p1", 0.0), ("p2", 1.0), ("p3", 2.0), ("p4", 3.0))
+    b = capture(("p1", 0.03), ("q2", 1.0), ("p3", 2.5), ("p4", 2.0))
+    assert pair._views(a, b) == [("p1", "p1"), ("p2", "q2"), ("p3", "p4")]
