@@ -126,7 +126,8 @@ def lit(root, *wanted, run=None):
         if run is not None:
             run.append(job)
     folder = root / "results/toy/relight"
-    return [rgb(read_exr(folder / f"{entry['name']}/frame_0000.exr")) for entry in wanted], folder
+    shown = [facts["name"] for facts in json.loads((folder / "relight.json").read_text())["relightings"]]
+    return [rgb(read_exr(folder / f"{name}/frame_0000.exr")) for name in shown], folder
 
 
 def test_as_found_is_the_truth_and_light_adds_up(toy):
@@ -150,6 +151,18 @@ def test_as_found_is_the_truth_and_light_adds_up(toy):
     assert Image.open(folder / "found/frame_0000.png").size == (40, 32)
     facts = json.loads((folder / "relight.json").read_text())["relightings"]
     assert [entry["method"] for entry in facts] == ["recombined", "recombined", "path traced", "path traced"]
+
+
+def test_the_only_lamp_alone_is_the_room_and_without_it_the_room_is_dark(toy):
+    (found, alone, without), folder = lit(
+        toy, {"name": "found"}, {"name": "alone", "each": "alone"}, {"name": "no", "each": "off"}
+    )
+    names = sorted(path.name for path in folder.iterdir() if path.is_dir())
+    assert names == ["alone_0", "found", "no_0"]
+    np.testing.assert_allclose(alone, found, rtol=1e-5)
+    assert found.any() and not without.any()
+    with refused("config/scenes/toy.yaml", "alone_0"):
+        lit(toy, {"name": "alone_0"}, {"name": "alone", "each": "alone"})
 
 
 def test_flight_denoised_and_lamp_that_moves(toy):

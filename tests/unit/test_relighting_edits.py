@@ -535,6 +535,29 @@ def test_lamps_are_called_by_object_or_id(things):
         things.check(entry(materials={"wal": {"metallic": 0}}))
 
 
+def test_each_lamp_alone_and_without_each():
+    """The strongest first, at most twelve, all summed from the pictures of one pass; other entries stay as they are."""
+    many = Inventory(["wall"], [Lamp(i, (0,), power) for i, power in enumerate([1.0, 5.0, 3.0, *[0.1] * 20])])
+    alone, without, plain = entry(each="alone"), entry(each="off", exposure="auto"), entry(emitters=0.5)
+    found = many.expanded([plain, alone, without])
+    assert len(found) == 1 + 12 + 12 and found[0] is plain
+    first, second = found[1:3]
+    assert (first["name"], second["name"]) == ("a_1", "a_2")
+    assert (first["emitters"], first["environment"], first["each"]) == (0.0, "off", None)
+    assert list(first["lamps"]) == ["1"] and first["lamps"]["1"]["factor"] == 1.0
+    last = found[13]
+    assert (last["emitters"], last["environment"], last["lamps"]["1"]["factor"], last["exposure"]) == (1.0, "keep", 0.0, "auto")
+    assert {key_of(lamp_basis(one)) for one in found[1:]} == {key_of(lamp_basis(alone)), key_of(lamp_basis(without))}
+    assert all(recombines(one) for one in found)
+    for one in found:
+        many.check(one)
+
+
+def test_each_takes_no_other_lamps():
+    with misset("", "value_error", "each", "lamps"):
+        Relighting.model_validate({"name": "a", "each": "alone", "lamps": {"0": "off"}})
+
+
 def test_a_way_through_a_wall_is_named(toy):
     camera = {
         "poses": [{"position": [0.3, 0.3, 1.6], "look_at": [2, 1, 1]}, {"position": [0.3, -1.0, 1.6], "look_at": [2, 1, 1]}]

@@ -10,19 +10,25 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
+from iif_core.numerics.color import luminance
 from workflow.artifacts import StageReader
 from workflow.scene.named import object_names, object_number
 from workflow.settings.names import did_you_mean
 
 Array = np.ndarray
 
+MOST_EACH = 12
+"""Lamps of which a relighting with `each` makes pictures."""
+
 
 @dataclass(frozen=True)
 class Lamp:
-    """An emitter that was kept: its id in emitters.parquet, and the objects that its faces belong to."""
+    """An emitter that was kept: its id in emitters.parquet, the objects that its faces belong to, and its power, in W up to a
+    factor that all share."""
 
     emitter_id: int
     objects: tuple[int, ...]
+    power: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -38,9 +44,12 @@ class Inventory:
         table, faces = emission.table("emitters.parquet"), emission.table("emitter_faces.parquet")
         object_id = segmentation.table("faces.parquet")["object_id"]
         lamps = []
-        for emitter in table["emitter_id"][table["kept"].astype(bool) & (table["kind"] == "area")]:
+        sides = np.where(table["side"] == 0, 2, 1)
+        power = luminance(np.stack([table[f"radiance_{c}"] for c in "rgb"], 1)) * table["area_m2"] * sides
+        for row in np.flatnonzero(table["kept"].astype(bool) & (table["kind"] == "area")):
+            emitter = int(table["emitter_id"][row])
             own = np.unique(object_id[faces["face_id"][faces["emitter_id"] == emitter]])
-            lamps.append(Lamp(int(emitter), tuple(int(o) for o in own if o >= 0)))
+            lamps.append(Lamp(emitter, tuple(int(o) for o in own if o >= 0), float(power[row])))
         return Inventory(object_names(segmentation), lamps)
 
     def name_of(self, lamp: Lamp) -> str:
@@ -61,6 +70,22 @@ class Inventory:
         hint = did_you_mean(key, [self.names[o] for lamp in self.lamps for o in lamp.objects], "{!r}")
         what = f"object {key!r} does not shine" if key in self.names else f"there is no lamp {key!r}"
         raise InputError(f"{where}: {what}.{hint} Lamps of this room: {there}; ids are in emitters.parquet")
+
+    def expanded(self, entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Return dumped relightings, those with `each` as one for each of the strongest lamps, the strongest first."""
+        strongest = sorted(self.lamps, key=lambda lamp: -lamp.power)[:MOST_EACH]
+        out = []
+        for entry in entries:
+            if not entry["each"]:
+                out.append(entry)
+                continue
+            rest, own = (0.0, 1.0) if entry["each"] == "alone" else (1.0, 0.0)
+            outside = "off" if entry["each"] == "alone" and entry["environment"] == "keep" else entry["environment"]
+            for lamp in strongest:
+                lamps = {str(lamp.emitter_id): {"factor": own, "colour": None, "move": None}}
+                name = f"{entry['name']}_{lamp.emitter_id}"
+                out.append(entry | {"name": name, "each": None, "emitters": rest, "lamps": lamps, "environment": outside})
+        return out
 
     def check(self, entry: dict[str, Any]) -> None:
         """Check the lamps and objects that a dumped relighting names.

@@ -195,6 +195,9 @@ class Relighting(Section):
     """Recovered emitters that `lamps` does not name: `on`, `off`, or a factor on their radiance."""
     lamps: Annotated[dict[str, RelightLamp], TEXT_KEYS] = Field(default_factory=dict)
     """Single lamps: id of emitters.parquet, or name of an object that shines -> factor, `on`, `off`, or its keys."""
+    each: Literal["alone", "off"] | None = None
+    """Instead of `emitters` and `lamps`: one picture for each of the twelve strongest lamps, with its light `alone`, or with all
+    but it (`off`). Names end with its `emitter_id`."""
     environment: Literal["keep", "off"] | Light | Colour | Path = "keep"
     """Light from outside: `keep`, `off`, a factor on what was found, a uniform radiance `[r, g, b]`, or a latitude-longitude EXR
     (top row = up)."""
@@ -225,6 +228,11 @@ class Relighting(Section):
     denoise: bool = True
     """Denoise the pictures."""
 
+    @field_validator("each", mode="before")
+    @classmethod
+    def _each_off(cls, value: Any) -> Any:  # YAML reads a bare `off` as false
+        return "off" if value is False else value
+
     @field_validator("environment", mode="before")
     @classmethod
     def _no_environment(cls, value: Any) -> Any:  # YAML reads a bare `off` as false
@@ -251,6 +259,12 @@ class Relighting(Section):
             raise ValueError("`camera` has several `views` or `poses` and takes one picture; give the number of its `frames`")
         if frames == 1 and self.video is not None and "video" in self.model_fields_set:
             raise ValueError("`video` of a camera that takes one picture; give the number of its `frames`, or leave out `video`")
+        return self
+
+    @model_validator(mode="after")
+    def _each_alone(self) -> Relighting:
+        if self.each and {"emitters", "lamps"} & self.model_fields_set:
+            raise ValueError("`each` says what is on; remove `emitters` and `lamps`")
         return self
 
     @model_validator(mode="after")
@@ -359,7 +373,7 @@ def all_files_of(entry: dict[str, Any]) -> list[Path]:
     return [file for path in named for file in (files_of_mesh(path) if path.suffix.lower() in MESHES else [path])]
 
 
-_NOT_TRACED = ("name", "emitters", "exposure", "response", "video", "method")
+_NOT_TRACED = ("name", "emitters", "each", "exposure", "response", "video", "method")
 """Keys of a relighting on which the light of single lamps does not depend."""
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.camera.response import Response, response
+from iif_core.errors import InputError
 from workflow.artifacts.store import split_rgb
 from workflow.relighting import sheet
 from workflow.relighting.camera import photograph_exposure
@@ -32,6 +33,8 @@ def run(job: Job) -> None:
     studio = Studio.open(job)
     bases = {one["key"]: one for one in job.read("lamp_images").json("lamp_images.json")["bases"]}
     with blamed_on_plan(job.scene):
+        wanted = studio.inventory.expanded(wanted)
+        _refuse_same_names(wanted)
         checked = [Frames.checked(studio, bases, entry) for entry in wanted]  # whatever is wrong stops the stage before any work
     curve = response("srgb") if studio.capture.is_hdr else read_response(job.read("affines"))
     facts, rows = [], []
@@ -41,6 +44,15 @@ def run(job: Job) -> None:
         rows.append(row)
     job.writer.bytes("contact_sheet.png", sheet.png(sheet.contact_sheet(rows, job.settings.relight_title)))
     job.writer.json("relight.json", {"title": job.settings.relight_title, "relightings": facts, "up": studio.up.tolist()})
+
+
+def _refuse_same_names(entries: list[dict[str, Any]]) -> None:
+    names = [entry["name"] for entry in entries]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice:
+        raise InputError(f"`relight.name`: two relightings would be called {twice!r}, one of them of a single lamp; rename one")
+    if not entries:
+        raise InputError("`relight.each`: no lamp was found, so there is none to see alone; remove the entry")
 
 
 def _relight(one: Frames, curve: Response) -> tuple[dict[str, Any], sheet.Row]:
