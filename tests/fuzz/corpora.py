@@ -203,6 +203,7 @@ def read_inserts() -> None:
 
 
 def pictures(home: Path) -> None:
+    import tifffile
     from PIL import Image
 
     rng = np.random.default_rng(0)
@@ -212,6 +213,13 @@ def pictures(home: Path) -> None:
     Image.fromarray(values[..., 0].astype(np.uint16) * 257).save(home / "16.png")
     Image.fromarray(values).save(home / "a.jpg", exif=_exif())
     Image.fromarray(values).save(home / "progressive.jpg", progressive=True)
+    for name, options in (("a.tif", {}), ("b.tif", {"compression": "zlib", "planarconfig": "separate"})):
+        deep = values.astype(np.uint16) * 257
+        tifffile.imwrite(home / name, np.moveaxis(deep, -1, 0) if options else deep, photometric="rgb", **options)
+    Image.fromarray(values).save(home / "c.tif", compression="tiff_lzw")
+    for name in ("a.webp", "a.avif", "a.bmp"):
+        Image.fromarray(values).save(home / name)
+    shutil.copy(Path(__file__).parents[1] / "unit/photograph.heic", home / "a.heic")
     channels = {c: values[..., i].astype(np.float32) / 255 for i, c in enumerate("RGB")}
     own.save_exr(home / "a.exr", channels)
     own.save_exr(home / "ids.exr", {"id": values[..., 0].astype(np.uint32)})
@@ -520,6 +528,8 @@ TARGETS: dict[str, Target] = {
     "PNG": Target(("8.png", "16.png", "palette.png"), pictures, read_pictures),
     "JPEG": Target(("a.jpg", "progressive.jpg"), pictures, read_pictures),
     "EXR": Target(("a.exr", "ids.exr"), pictures, read_pictures),
+    "HEIF": Target(("a.heic", "a.avif"), pictures, read_pictures),
+    "TIFF": Target(("a.tif", "b.tif", "c.tif", "a.webp", "a.bmp"), pictures, read_pictures),
     "response": Target(("r.npy", "r.parquet", "r.csv"), responses, read_responses),
     "manifests": Target(
         (
