@@ -138,7 +138,7 @@ def _write_plan(scene: str, quality: str) -> None:
     from workflow.artifacts.files import write_atomically
     from workflow.decisions.expected import STAGES as COSTLY
     from workflow.decisions.expected import with_expectation
-    from workflow.decisions.record import plan_text
+    from workflow.decisions.record import plan_sentences, plan_text
     from workflow.runtime import forecast
 
     links.check_folder(f"plan/{scene}")
@@ -146,7 +146,12 @@ def _write_plan(scene: str, quality: str) -> None:
     cost = forecast.together(COSTLY, scene, quality)
     text = plan_text(scene, quality, [with_expectation(item, cost) for item in plan])
     write_atomically(Path("plan") / scene / "plan.yaml", lambda path: path.write_text(text))
-    print(text)
+    capture = StageReader(Path("results") / scene / "capture", "capture", scene)
+    counts = f"{capture.rows('cameras.parquet')} photographs, {capture.rows('faces.parquet')} faces"
+    read = [counts, *capture.json("capture.json")["notes"]]
+    for title, lines in (("what was read", read), (f"what {scene} requires", plan_sentences(plan))):
+        print("\n".join([f"{title}:", *(f"  {line}" for line in lines)]))
+    print(f"all of it, with numbers and what is expected: plan/{scene}/plan.yaml")
 
 
 def _relit(arguments: argparse.Namespace) -> int:

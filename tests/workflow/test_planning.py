@@ -15,7 +15,8 @@ def test_the_plan_needs_capture_alone_and_is_shown(workflow):
     result = workflow.run("plan/tiny", "--forcerun", "plan")
     assert result.returncode == 0, result.stderr[-4000:]
     shown = yaml.safe_load((workflow.folder / "plan/tiny/plan.yaml").read_text())
-    assert "component: environment" in result.stdout + result.stderr
+    said = result.stdout + result.stderr
+    assert "environment: left out: " in said and "what was read:\n  4 photographs" in said and "component:" not in said
     of = {item["component"]: item for item in shown["components"]}
     assert of["environment"]["status"] == "settled" and "closed" in of["environment"]["reason"]
     assert of["camera_response"]["included"] is False  # linear photographs

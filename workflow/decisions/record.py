@@ -44,6 +44,22 @@ def plan_text(scene: str, quality: str, plan: list[Decision]) -> str:
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
 
 
+def plan_sentences(plan: list[Decision]) -> list[str]:
+    """Return the plan in a few sentences for a terminal: one for each decision that is made, one for all that are not yet."""
+    made = [item for item in plan if item["status"] != PROVISIONAL]
+    out = []
+    for item in made:
+        what = "modelled" if item["included"] else "left out"
+        asked = ", as the settings ask" if item["status"] == FORCED else ""
+        out.append(f"{_in_words(item)}: {what}{asked}: {item['reason']}")
+    later = ", ".join(_in_words(item) for item in plan if item["status"] == PROVISIONAL)
+    return [*out, f"decided while the scene is solved: {later}"] if later else out
+
+
+def _in_words(item: Decision) -> str:
+    return str(item["component"]).replace("_", " ")
+
+
 EVIDENCE = "gain of held-out log likelihood, in standard errors"
 
 
