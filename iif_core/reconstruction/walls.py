@@ -17,13 +17,15 @@ TILE = 0.1
 """Edge (m) of the squares of which walls are made."""
 NEAR = 0.06
 """Distance (m) from the mesh up to which a tile is there already."""
+BEHIND = 0.02
+"""Least distance (m) by which tiles that overlap with the mesh lie behind it, so that no crack is left at its border."""
+RINGS = 2
+"""Tiles by which they overlap."""
 THROUGH = 0.05
 """Share by which a depth map must look beyond a tile to say that nothing is there."""
 
-
 BEYOND = 0.05
 """Largest share of the area behind a wall: depth that is wrong."""
-
 NOISE = 0.005
 """Share of the area at each end of the room that is such depth."""
 
@@ -49,7 +51,7 @@ def missing_walls(vertices: NDArray, faces: NDArray, depths: Sequence[NDArray], 
     """Return what a mesh lacks of the planes around it.
 
     The planes are those of `enclosure`. A square of a plane is built where no surface is near, and no depth map shows anything
-    behind it, as through a door.
+    behind it, as through a door. What is built goes on a little behind the surface at its border.
 
     Args:
         vertices, faces: (n, 3), metres, and (m, 3), with an area.
@@ -77,13 +79,30 @@ def missing_walls(vertices: NDArray, faces: NDArray, depths: Sequence[NDArray], 
         of_side.append(np.full(len(quads), number))
     points, quads, side = np.concatenate(corners), np.concatenate(tiles), np.concatenate(of_side)
     centre = points[quads].mean(1)
-    away = np.linalg.norm(closest_points(vertices, faces, centre).points - centre, axis=1)
-    kept = (away > NEAR) & ~_seen_through(centre, depths, pictures)
+    away = _distance(vertices, faces, centre)
+    lacks = (away > NEAR) & ~_seen_through(centre, depths, pictures)
+
+    # -------- tiles beside those that are lacking overlap with the mesh, behind it --------
+    kept = lacks.copy()
+    for _ in range(RINGS):
+        touched = np.zeros(len(points), bool)
+        touched[quads[kept]] = True
+        kept |= (away <= NEAR) & touched[quads].any(1)
     quads, side = quads[kept], side[kept]
-    used, local = np.unique(quads, return_inverse=True)
+    used, first, local = np.unique(quads, return_index=True, return_inverse=True)
+    of_corner = side[first // 4]
+    placed = points[used]
+    back = np.where(np.isnan(error), BEHIND, np.maximum(2 * np.nan_to_num(error), BEHIND))[of_corner]
+    placed = placed - (back * (_distance(vertices, faces, placed) <= NEAR))[:, None] * sides.normal[of_corner]
     local = local.reshape(-1, 4)
     both = np.concatenate([local[:, [0, 1, 2]], local[:, [0, 2, 3]]])
-    return Walls(points[used], both, np.concatenate([side, side]), sides, error)
+    return Walls(placed, both, np.concatenate([side, side]), sides, error)
+
+
+def _distance(vertices: NDArray, faces: NDArray, points: NDArray) -> NDArray:
+    if not len(points):
+        return np.zeros(0)
+    return np.linalg.norm(closest_points(vertices, faces, points).points - points, axis=1)
 
 
 def _tiles(outline: NDArray, inward: NDArray) -> tuple[NDArray, NDArray]:

@@ -119,7 +119,8 @@ def check_room(root, count, tolerance):
     assert high[2] - low[2] == pytest.approx(SIZE[2], abs=3 * tolerance) and abs(low[2]) < 2 * tolerance
     apart = np.minimum(np.abs(middle - low), np.abs(middle - high)).min(1)
     assert np.median(apart) < tolerance
-    assert area.sum() == pytest.approx(2 * (SIZE[0] * SIZE[1] + SIZE[1] * SIZE[2] + SIZE[0] * SIZE[2]), rel=0.15)
+    whole = 2 * (SIZE[0] * SIZE[1] + SIZE[1] * SIZE[2] + SIZE[0] * SIZE[2])
+    assert 0.9 * whole < area.sum() < 1.35 * whole  # walls overlap with what was found
     return made, facts
 
 
@@ -139,7 +140,7 @@ def test_known_cameras_give_the_room(tmp_path, monkeypatch):
         depth, face = capture.gbuffer(view)
         _, truth = shot(pose)
         shown = truth.reshape(48, 5, 64, 5).mean((1, 3))
-        assert (face >= 0).mean() > 0.9
+        assert (face >= 0).mean() > 0.98
         assert np.median(np.abs(depth / shown - 1)[face >= 0]) < 0.02
     assert any("source.room_height" in note for note in capture.facts["notes"])
 
