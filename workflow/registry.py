@@ -80,7 +80,7 @@ STAGES: dict[str, Stage] = {
             "reconstruction",
             "Find the cameras of photographs, and a mesh; of scenes that have nothing else.",
             (),
-            ("source",),
+            tuple(f"source.{key}" for key in ("kind", "path", "most", "detail", "colour", "room_height", "camera_height")),
             reads_raw=True,
             on_demand=True,
             files=("workflow.sources.photographs",),

@@ -102,7 +102,8 @@ def described(
         else:
             kinds.append("wall" if upright[i] and size[i] >= WALL and high[i] - low[i] >= HIGH * tall else "piece")
     added = np.zeros(count, bool) if built is None else np.asarray(built, bool)
-    colours = ["added" if a else colour_name(c) if s else "unseen" for a, c, s in zip(added, albedo, seen, strict=True)]
+    known = np.asarray(seen, bool) & np.isfinite(np.asarray(albedo, np.float64)).all(1)
+    colours = ["added" if a else colour_name(c) if s else "unseen" for a, c, s in zip(added, albedo, known, strict=True)]
     names = [f"{colour} {kind}" for colour, kind in zip(colours, kinds, strict=True)]
 
     # -------- numbers by size, where a name is not the only one --------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_matrix
 
 BEST_ANGLE = 8.0
 """Degrees between two lines of sight at which depth is exact enough, and the pictures are still alike."""
@@ -28,17 +29,16 @@ def neighbours(point: ArrayLike, view: ArrayLike, points: ArrayLike, centres: Ar
     point, view = np.asarray(point, np.int64), np.asarray(view, np.int64)
     points, centres = np.asarray(points, np.float64), np.asarray(centres, np.float64)
     count = len(centres)
-    shows = np.zeros((count, len(points)), bool)
-    shows[view, point] = True
-    sight = points[None] - centres[:, None]
-    sight /= np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-12)
+    shows = csr_matrix((np.ones(len(point), bool), (view, point)), (count, len(points)))
     out = []
     for i in range(count):
-        own = shows[i]
-        cosine = np.einsum("vpc,pc->vp", sight[:, own], sight[i, own])
-        angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+        own = shows[i].indices
+        also = shows[:, own].toarray()
+        sight = points[own][None] - centres[:, None]
+        sight /= np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-12)
+        angle = np.degrees(np.arccos(np.clip(np.einsum("vpc,pc->vp", sight, sight[i]), -1, 1)))
         width = np.where(angle < BEST_ANGLE, _BELOW, _ABOVE)
-        score = (np.exp(-0.5 * ((angle - BEST_ANGLE) / width) ** 2) * shows[:, own]).sum(1)
+        score = (np.exp(-0.5 * ((angle - BEST_ANGLE) / width) ** 2) * also).sum(1)
         score[i] = 0
         order = np.argsort(-score, kind="stable")[:most]
         out.append(order[score[order] > 0])

@@ -47,7 +47,9 @@ class Walls(NamedTuple):
     error: NDArray
 
 
-def missing_walls(vertices: NDArray, faces: NDArray, depths: Sequence[NDArray], pictures: Sequence[Picture]) -> Walls:
+def missing_walls(
+    vertices: NDArray, faces: NDArray, depths: Sequence[NDArray], pictures: Sequence[Picture], points: NDArray | None = None
+) -> Walls:
     """Return what a mesh lacks of the planes around it.
 
     The planes are those of `enclosure`. A square of a plane is built where no surface is near, and no depth map shows anything
@@ -57,9 +59,10 @@ def missing_walls(vertices: NDArray, faces: NDArray, depths: Sequence[NDArray], 
         vertices, faces: (n, 3), metres, and (m, 3), with an area.
         depths: (H, W) z-depth of each picture, NaN = unknown.
         pictures: their cameras.
+        points: (p, 3) that photographs show: where no plane is, sides are built behind nearly all of them.
     """
     centres = np.array([picture.centre for picture in pictures])
-    sides = enclosure(vertices, faces, centres, "planes", margin=0.0, beyond=BEYOND, noise=NOISE)
+    sides = enclosure(vertices, faces, centres, "planes", margin=0.0, beyond=BEYOND, noise=NOISE, shown=points)
     normal, area = face_geometry(vertices, faces)
     middle = vertices[faces].mean(1)
     corners, tiles, of_side, error = [], [], [], np.full(len(sides.normal), np.nan)

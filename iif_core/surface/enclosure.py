@@ -6,9 +6,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import HalfspaceIntersection
+from scipy.spatial import ConvexHull, HalfspaceIntersection
 
-from iif_core.surface.triangles import face_geometry
+from iif_core.surface.triangles import face_crosses, face_geometry
 
 ALIKE = float(np.cos(np.radians(10.0)))
 """Cosine of the largest angle between normals of one direction."""
@@ -48,6 +48,7 @@ def enclosure(
     margin: float = 0.02,
     beyond: float = BEYOND,
     noise: float = 0.0,
+    shown: ArrayLike | None = None,
 ) -> Enclosure:
     """Build the closed surface around a scan.
 
@@ -61,6 +62,7 @@ def enclosure(
         margin: distance (m) of the sides behind what they close, so that walls of the scan stay in front.
         beyond: largest share of the area that may lie behind a plane that bounds the room.
         noise: share of the area that is left out at each end of the extent; 0 = the extent of all vertices.
+        shown: (p, 3) further points of surface; sides at the extent lie behind all but one in a hundred of them.
 
     Returns:
         The surface. It contains all points, and the scan but for what lies behind its planes and for noise.
@@ -86,6 +88,8 @@ def enclosure(
     outward = outward[(outward @ found[:, :3].T < ALIKE).all(1)]
     extent = [_end(middle @ n, area, noise) if noise > 0 else (vertices[np.unique(faces)] @ n).max() for n in outward]
     bound = np.maximum(extent, (within @ outward.T).max(0)) if len(outward) else np.zeros(0)
+    if shown is not None and len(np.asarray(shown)) and len(outward):
+        bound = np.maximum(bound, np.quantile(np.asarray(shown, np.float64) @ outward.T, 0.99, axis=0))
 
     both = np.concatenate([found[:, :3], outward]), np.concatenate([found[:, 3], bound]) + margin
     return _polyhedron(*both, np.arange(len(both[0])) < len(found), within.mean(0))
@@ -201,18 +205,12 @@ def _polyhedron(outward: NDArray, bound: NDArray, from_plane: NDArray, inside: N
     corners = HalfspaceIntersection(np.column_stack([outward, -bound]), inside).intersections
     size = np.ptp(corners, axis=0).max()
     corners = np.unique(np.round(corners / (1e-9 * size)).astype(np.int64), axis=0) * (1e-9 * size)
-    faces, side, kept = [], [], []
-    for n, d, planar in zip(outward, bound, from_plane, strict=True):
-        on = np.flatnonzero(np.abs(corners @ n - d) <= 1e-6 * size)
-        if len(on) < 3:  # the other sides cut all of it away
-            continue
-        # Around the middle of a side, such that its front is inside.
-        across = np.eye(3)[np.abs(n).argmin()]
-        u = np.cross(n, across)
-        from_middle = corners[on] - corners[on].mean(0)
-        on = on[np.argsort(np.arctan2(from_middle @ u, from_middle @ np.cross(n, u)))]
-        faces += [(on[0], on[i], on[i + 1]) for i in range(1, len(on) - 1)]
-        side += [len(kept)] * (len(on) - 2)
-        kept.append((*-n, planar))
-    kept_array = np.array(kept, np.float64)
-    return Enclosure(corners, np.array(faces, np.int64), np.array(side), kept_array[:, :3], kept_array[:, 3] > 0)
+    hull = ConvexHull(corners)
+    corners, faces = corners[hull.vertices], np.searchsorted(hull.vertices, hull.simplices, sorter=np.argsort(hull.vertices))
+    faces = np.argsort(hull.vertices)[faces]
+    # The front of a face is inside.
+    normal = hull.equations[:, :3]
+    turned = np.einsum("ij,ij->i", face_crosses(corners, faces), normal) > 0
+    faces[turned] = faces[turned][:, ::-1]
+    used, side = np.unique((normal @ outward.T).argmax(1), return_inverse=True)
+    return Enclosure(corners, faces.astype(np.int64), side.ravel(), -outward[used], from_plane[used])

@@ -2,6 +2,8 @@
 
 import json
 import struct
+import subprocess
+import sys
 import unicodedata
 import zlib
 from pathlib import Path
@@ -509,24 +511,98 @@ def test_heic_that_is_cut_short_is_refused_before_work(tmp_path, kept):
         images.header(tmp_path / "a.heic")
 
 
-def test_code_points_of_heic_count(monkeypatch):
-    """Those of a file are Rec. 709; read as Display P3, its colours are converted, and PQ is refused."""
+def test_code_points_of_heic_count(tmp_path):
+    """Those of the file are Rec. 709; stated as Display P3, its colours are converted, and PQ is refused."""
+    data = bytearray(TELEPHONE.read_bytes())
+    at = data.find(b"colrnclx")
+    assert at > 0
     plain = images.load_photo(TELEPHONE).pixels
-    points = {"color_primaries": 12, "transfer_characteristics": 13}
-    with images.opened(TELEPHONE) as image:
-        kind = type(image)
-    before = kind.__init__
+    data[at + 8 : at + 12] = bytes([0, 12, 0, 13])
+    (tmp_path / "p3.heic").write_bytes(data)
+    np.testing.assert_allclose(images.load_photo(tmp_path / "p3.heic").pixels, SPACES["display_p3"].to_srgb(plain), atol=1e-6)
+    data[at + 8 : at + 12] = bytes([0, 9, 0, 16])
+    (tmp_path / "pq.heic").write_bytes(data)
+    with refused("pq.heic", "PQ"):
+        images.load_photo(tmp_path / "pq.heic")
 
-    def stated(self, *facts, **more):
-        before(self, *facts, **more)
-        self.info["nclx_profile"] = dict(points)
 
-    monkeypatch.setattr(kind, "__init__", stated)
-    photo = images.load_photo(TELEPHONE)
-    np.testing.assert_allclose(photo.pixels, SPACES["display_p3"].to_srgb(plain), atol=1e-6)
-    points["transfer_characteristics"] = 16
-    with refused("photograph.heic", "PQ"):
-        images.load_photo(TELEPHONE)
+@pytest.mark.parametrize("suffix", ["tif", "webp", "bmp", "png"])
+def test_other_formats_need_nothing_that_was_read_before(tmp_path, suffix):
+    """In a process of its own: what reads HEIC is loaded for HEIC alone, and other files do without."""
+    path = tmp_path / f"a.{suffix}"
+    Image.fromarray(np.full((6, 8, 3), 100, np.uint8)).save(path)
+    (tmp_path / "b.png").write_bytes(b"no picture")
+    probe = f"""
+from pathlib import Path
+from iif_core.errors import InputError
+from workflow.sources.folder_scene import images
+assert images.load_photo(Path({str(path)!r})).pixels.shape == (6, 8, 3)
+try:
+    images.header(Path({str(tmp_path / "b.png")!r}))
+except InputError as error:
+    assert "none of PNG, JPEG, HEIF" in str(error), error
+else:
+    raise SystemExit("accepted")
+"""
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, cwd=Path(__file__).parents[2])
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("kind", ["8.tif", "16.tif", "8.jpg", "8.webp"])
+def test_every_format_is_turned_once(tmp_path, kind, orientation):
+    values = np.random.default_rng(0).integers(0, 256, (6, 10, 3), np.uint8)
+    values = np.repeat(np.repeat(values, 8, 0), 8, 1)  # JPEG keeps blocks
+    path = tmp_path / kind
+    exif = Image.Exif()
+    exif[274] = orientation
+    if kind == "16.tif":
+        tifffile.imwrite(path, values.astype(np.uint16) * 257, photometric="rgb", extratags=[(274, 3, 1, orientation, True)])
+    else:
+        options = {"8.webp": {"lossless": True}, "8.jpg": {"quality": 100, "subsampling": 0}}.get(kind, {})
+        Image.fromarray(values).save(path, exif=exif, **options)
+    header = images.header(path)
+    shown = images.TURNS[orientation](values) / 255
+    photo = images.load_photo(path, header.orientation)
+    assert photo.pixels.shape == shown.shape
+    np.testing.assert_allclose(photo.pixels, shown, atol=0.02)
+    turned = header.orientation in (5, 6, 7, 8)
+    assert header.size == (shown.shape[:2] if turned else shown.shape[1::-1])
+
+
+def test_opacity_and_inverted_grey_of_a_tiff(tmp_path):
+    colour, alpha = np.full((4, 5, 3), 20000, np.uint16), np.full((4, 5, 1), 40000, np.uint16)
+    both = np.concatenate([colour, alpha], -1)
+    for name, extra, shown in (("unassociated", "unassalpha", 20000), ("associated", "assocalpha", 32767.5)):
+        tifffile.imwrite(tmp_path / f"{name}.tif", both, photometric="rgb", extrasamples=[extra])
+        photo = images.load_photo(tmp_path / f"{name}.tif")
+        np.testing.assert_allclose(photo.pixels, shown / 65535, atol=2e-5)
+        assert photo.valid.all()
+    tifffile.imwrite(
+        tmp_path / "other.tif", np.concatenate([colour, 0 * alpha], -1), photometric="rgb", extrasamples=["unspecified"]
+    )
+    assert images.load_photo(tmp_path / "other.tif").valid.all()
+    tifffile.imwrite(tmp_path / "white.tif", colour[..., 0], photometric="miniswhite")
+    np.testing.assert_allclose(images.load_photo(tmp_path / "white.tif").pixels, 1 - 20000 / 65535, atol=2e-5)
+
+
+def test_a_thumbnail_is_not_taken_for_the_photograph(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        file.write(np.zeros((4, 5, 3), np.uint8), photometric="rgb")
+        file.write(np.zeros((40, 50, 3), np.uint8), photometric="rgb")
+    with refused("a.tif", "2 pictures", "largest"):
+        images.header(tmp_path / "a.tif")
+
+
+def test_code_points_of_avif_count(tmp_path):
+    Image.fromarray(np.full((16, 16, 3), 100, np.uint8)).save(tmp_path / "a.avif", quality=100)
+    data = bytearray((tmp_path / "a.avif").read_bytes())
+    at = data.find(b"colrnclx")
+    assert at > 0 and images.load_photo(tmp_path / "a.avif").form == ""
+    data[at + 8 : at + 12] = bytes([0, 9, 0, 16])
+    (tmp_path / "b.avif").write_bytes(data)
+    with refused("b.avif", "PQ"):
+        images.load_photo(tmp_path / "b.avif")
 
 
 @pytest.mark.parametrize("options", [{}, {"compression": "zlib"}, {"planarconfig": "separate"}, {"byteorder": ">"}])

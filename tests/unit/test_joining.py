@@ -62,3 +62,8 @@ def test_lamps_and_parts_of_other_kinds_stay_apart():
 def test_a_thing_that_is_called_small_pieces_keeps_its_name():
     parts = [square(0, 9.0, name="small pieces"), *(square(i, 1.0) for i in range(1, 5))]
     assert [part.name for part in joined(parts, 2)] == ["small pieces", "small pieces 2"]
+
+
+def test_a_part_alone_of_its_kind_keeps_its_name():
+    parts = [square(i, 1.0 + i, double_sided=True, opacity=0.1 + 0.1 * i) for i in range(6)]
+    assert joined(parts, 3) == parts

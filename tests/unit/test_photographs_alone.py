@@ -1,6 +1,7 @@
 """Source `photographs`: a textured room of known size, photographed by known cameras, of which the program sees the pictures."""
 
 import json
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -130,7 +131,7 @@ def test_known_cameras_give_the_room(tmp_path, monkeypatch):
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))
     exact = sparse_of(20).placed(turn, np.array([3.0, -1.0, 2.0]), 0.37)
-    monkeypatch.setattr("workflow.stages.reconstruction.find_cameras", lambda root, names, *rest: exact)
+    monkeypatch.setattr("workflow.stages.reconstruction.find_cameras", lambda *given: exact)
     capture = own.run(tmp_path, "reconstruction", "capture")
     made, facts = check_room(tmp_path, 20, 0.03)
     assert facts["scale"]["metres_per_unit"] == pytest.approx(1 / 0.37, rel=0.01)
@@ -172,17 +173,17 @@ def test_photographs_of_nothing_are_refused(tmp_path):
 
 
 def test_a_camera_that_others_contradict_is_left_out(tmp_path, monkeypatch):
-    photographed(scene(tmp_path, detail=96, camera_height=1.4), 10)
-    exact = sparse_of(10)
+    photographed(scene(tmp_path, detail=128, camera_height=1.4), 16)
+    exact = sparse_of(16)
     wrong = exact.camera_from_world.copy()
     wrong[4] = np.linalg.inv(look_at((3.5, 0.4, 2.2), (0.5, 2.5, 0.3), (0, 0, 1)))[:3]
     moved = Sparse(*[wrong if name == "camera_from_world" else getattr(exact, name) for name in Sparse.__dataclass_fields__])
-    monkeypatch.setattr("workflow.stages.reconstruction.find_cameras", lambda root, names, *rest: moved)
+    monkeypatch.setattr("workflow.stages.reconstruction.find_cameras", lambda *given: moved)
     with own.working_in(tmp_path):
         run_stage("reconstruction", "own", "draft", 2)
     made = StageReader(tmp_path / "results/own/reconstruction", "reconstruction", "own")
     facts = made.json("reconstruction.json")
-    assert "004.png" in facts["left_out"] and facts["photographs"] >= 8
+    assert "004.png" in facts["left_out"] and facts["photographs"] >= 13
     assert facts["scale"]["from"] == "camera_height" and any("guessed" in note for note in facts["notes"])
     assert all(frame["file_path"] != "004.png" for frame in json.loads(made.path("transforms.json").read_text())["frames"])
 
@@ -224,8 +225,6 @@ def test_pictures_are_reduced_with_their_cameras(tmp_path):
 
 def test_working_copies_keep_what_exif_says_of_the_lens_and_stand_upright(tmp_path):
     """One folder for each camera: another size, model or focal length is another one."""
-    from collections import Counter
-
     exif = Image.Exif()
     exif[274], exif[272] = 6, "Telephone"
     exif.get_ifd(0x8769)[41989] = 26
@@ -255,10 +254,16 @@ def test_only_scenes_of_photographs_alone_need_the_stage(tmp_path):
         alone, other = (fingerprint.parsed(fingerprint.resolved(name, "draft")) for name in ("own", "other"))
         assert STAGES["capture"].reads(alone) == ("reconstruction",) and STAGES["capture"].reads(other) == ()
         assert STAGES["plan"].reads(alone) == ("capture",)
-        before = fingerprint.fingerprint("capture", "own", "draft")
-        (root / "config/scenes/own.yaml").write_text(
-            (root / "config/scenes/own.yaml").read_text().replace("data/own", "data/own/.")
+        assert "reconstruction" in fingerprint.needed("own", "draft") and "reconstruction" not in fingerprint.needed(
+            "other", "draft"
         )
+        assert fingerprint.missing_stages("own", "draft")[0] == "reconstruction"
+        made, before = (fingerprint.fingerprint(stage, "own", "draft") for stage in ("reconstruction", "capture"))
+    scene(root, alignment="warn", close_holes=0.2)
+    with own.working_in(root):  # what the capture alone reads does not find cameras again
+        assert fingerprint.fingerprint("reconstruction", "own", "draft") == made
+        assert fingerprint.fingerprint("capture", "own", "draft") != before
+    scene(root)
     photographed(root / "data/own", 4)  # one more photograph changes everything
     with own.working_in(root):
         assert fingerprint.fingerprint("capture", "own", "draft") != before
@@ -272,7 +277,12 @@ def test_photographs_are_found_in_folders_and_masks_are_none(tmp_path):
         else:
             Image.new("RGB", (8, 6)).save(tmp_path / name)
     Image.new("RGB", (8, 6)).save(tmp_path / "c.png")
+    (tmp_path / "._c.png").write_bytes(b"of another system")
     assert photographs.chosen(tmp_path, 10) == ["a/1.JPG", "b/2.png", "c.png"]
+    Image.new("RGB", (8, 6)).save(tmp_path / "a/1.webp")
+    with refused("1.JPG", "1.webp", "two formats"):
+        photographs.chosen(tmp_path, 10)
+    (tmp_path / "a/1.webp").unlink()
     assert photographs.chosen(tmp_path, 2) == ["a/1.JPG", "c.png"]
     (tmp_path / "c.png").unlink()
     with refused(tmp_path, "2 photographs", "3"):
@@ -285,3 +295,36 @@ def test_photographs_are_found_in_folders_and_masks_are_none(tmp_path):
 def test_a_height_that_no_room_has_is_refused():
     with misset("source.photographs.room_height", "less_than"):
         settings.SceneSettings.model_validate({"source": {"kind": "photographs", "path": "x", "room_height": 260}})
+
+
+def test_range_and_kind_of_photographs_are_checked_before_work(tmp_path):
+    folder = scene(tmp_path)
+    photographed(folder, 3)
+    document = settings.dump(settings.SceneSettings.model_validate({"source": {"kind": "photographs", "path": str(folder)}}))
+    assert len(photographs.raw_inputs(document)) == 3
+    with refused("hdr"):
+        photographs.raw_inputs(document | {"capture": document["capture"] | {"dynamic_range": "hdr"}})
+
+
+def test_exif_of_any_length_fits_into_a_working_copy(tmp_path):
+    exif = Image.Exif()
+    exif[274] = 1
+    exif.get_ifd(0x8769)[37500] = bytes(80_000)
+    exif.get_ifd(0x8769)[41989] = 28
+    Image.fromarray(np.full((30, 40, 3), 90, np.uint8)).save(tmp_path / "a.png", exif=exif)
+    reconstruction._working_copy(tmp_path / "a.png", tmp_path / "w", 0, Counter(), "file")
+    with Image.open(tmp_path / "w/000/000000.jpg") as copy:
+        assert copy.getexif().get_ifd(0x8769)[41989] == 28
+
+
+@pytest.mark.long
+def test_the_same_photographs_give_the_same_cameras_also_in_pairs_of_neighbours(tmp_path, monkeypatch):
+    photographed(tmp_path / "p", 12)
+    names = [f"{i:03d}.png" for i in range(12)]
+    quiet = lambda *_: None  # noqa: E731
+    first, second = (reconstruction.find_cameras(tmp_path / "p", names, "file", quiet) for _ in range(2))
+    np.testing.assert_array_equal(first.camera_from_world, second.camera_from_world)
+    np.testing.assert_array_equal(first.points, second.points)
+    monkeypatch.setattr(reconstruction, "EVERY_PAIR", 0)
+    monkeypatch.setattr(reconstruction, "BESIDE", 4)
+    assert len(reconstruction.find_cameras(tmp_path / "p", names, "file", quiet).names) >= 8

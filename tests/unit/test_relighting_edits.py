@@ -544,13 +544,25 @@ def test_each_lamp_alone_and_without_each():
     first, second = found[1:3]
     assert (first["name"], second["name"]) == ("a_1", "a_2")
     assert (first["emitters"], first["environment"], first["each"]) == (0.0, "off", None)
-    assert list(first["lamps"]) == ["1"] and first["lamps"]["1"]["factor"] == 1.0
+    assert list(first["lamps"]) == ["emitter 1"] and first["lamps"]["emitter 1"]["factor"] == 1.0
     last = found[13]
-    assert (last["emitters"], last["environment"], last["lamps"]["1"]["factor"], last["exposure"]) == (1.0, "keep", 0.0, "auto")
+    assert (last["emitters"], last["environment"], last["lamps"]["emitter 1"]["factor"], last["exposure"]) == (
+        1.0,
+        "keep",
+        0.0,
+        "auto",
+    )
     assert {key_of(lamp_basis(one)) for one in found[1:]} == {key_of(lamp_basis(alone)), key_of(lamp_basis(without))}
     assert all(recombines(one) for one in found)
     for one in found:
         many.check(one)
+
+
+def test_a_lamp_is_told_from_an_object_that_is_called_by_a_number():
+    odd = Inventory(["wall", "5", "sofa"], [Lamp(5, (0,)), Lamp(6, (1,))])
+    assert odd.lamps_called("5", "x") == [1] and odd.lamps_called("emitter 5", "x") == [0]
+    found = odd.expanded([entry(each="alone")])
+    assert [odd.lamps_called(next(iter(one["lamps"])), "x") for one in found] == [[0], [1]]
 
 
 def test_each_takes_no_other_lamps():

@@ -86,7 +86,7 @@ def check(scene: str, quality: str) -> tuple[str, ...]:
         InputError: the folder of what is published is a file, or a link is where jobs write; or as `check_stage`.
     """
     links.check_folders(Path("results"), scene)
-    for stage in fp.NEEDED:
+    for stage in fp.needed(scene, quality):
         check_stage(stage, scene, quality)
     mark = fp.fingerprint("publish", scene, quality)
     return sound.deliverable_faults(Path(f"scenes/{scene}"), Path("results"), scene, mark)

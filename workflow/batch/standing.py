@@ -111,7 +111,7 @@ def _at_rest(found: Standing, jobs: dict[str, Noted]) -> Standing:
     published, touched = facts_in(path), os.stat(path).st_mtime if os.path.isfile(path) else None
     current = published.get("fingerprint") == fp.fingerprint("publish", scene, quality)
     missing = [] if current else fp.missing_stages(scene, quality)
-    ended = _ended(jobs, missing or list(fp.NEEDED), scene, quality)
+    ended = _ended(jobs, missing or list(fp.needed(scene, quality)), scene, quality)
     if current and not faults:
         how = f"it is published, but its last job of {ended[0]} {ended[1].state}: {ended[1].reason}" if ended else ""
         log = ended[1].log if ended else f"results/{scene}/logs/publish.log"

@@ -15,7 +15,7 @@ NO_OBJECT = -1
 
 
 def joined(parts: Sequence[TexturedPart], most: int) -> list[TexturedPart]:
-    """Join the parts of least area until at most `most` are left, if lamps allow it.
+    """Join the parts of least area until at most `most` are left, if lamps and the kinds of parts allow it.
 
     A lamp, or a part of it, stays by itself. Parts are joined if what a file says of a whole part is the same: whether it is a
     sheet that is seen from both sides, how much light passes it, and whether it was simplified. Vertices, normals and texture
@@ -36,6 +36,7 @@ def joined(parts: Sequence[TexturedPart], most: int) -> list[TexturedPart]:
         if len(parts) - left + len(groups) <= most:
             break
         groups[kinds[i]].append(i)
+    groups = {kind: members for kind, members in groups.items() if len(members) > 1}  # one alone would lose its name for nothing
     gone = {i for members in groups.values() for i in members}
     out = [part for i, part in enumerate(parts) if i not in gone]
     taken = {part.name for part in out}

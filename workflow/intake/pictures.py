@@ -101,10 +101,14 @@ def opened(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Any]:
     check_file(path, _LARGEST_FILE, "a picture")
     check_chunks(path)
     check_boxes(path)
-    if "HEIF" in formats and _begins_with_boxes(path):
-        import pi_heif
+    allowed = formats
+    if "HEIF" in formats:
+        if begins_with_boxes(path):
+            import pi_heif
 
-        pi_heif.register_heif_opener()
+            pi_heif.register_heif_opener()
+        else:  # Pillow knows no format that nobody has registered
+            formats = tuple(name for name in formats if name != "HEIF")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the size is checked here, against our own limit
         try:
@@ -112,7 +116,7 @@ def opened(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Any]:
         except Image.DecompressionBombError as error:
             raise InputError(f"{path}: too many pixels ({error}); allowed are {limits.PICTURE_PIXELS}") from None
         except UnidentifiedImageError:
-            kinds = ", ".join(formats)
+            kinds = ", ".join(allowed)
             why = f"its content is none of {kinds}, whatever its name"
             raise InputError(f"{path}: not a readable image ({why}); save it as one of them") from None
         with image:
@@ -120,9 +124,22 @@ def opened(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Any]:
             yield image
 
 
-def _begins_with_boxes(path: Path) -> bool:
+def begins_with_boxes(path: Path) -> bool:
+    """Return whether a file consists of boxes, as HEIF and AVIF do."""
     with path.open("rb") as file:
         return file.read(8)[4:] == _BOXES
+
+
+def code_points(path: Path) -> tuple[int, int] | None:
+    """Return the numbers of ITU-T H.273 for primaries and transfer function of a file of boxes, None without any."""
+    if not begins_with_boxes(path):
+        return None
+    with path.open("rb") as file:
+        start = file.read(_LARGEST_CHUNK)
+    at = start.find(b"colrnclx")
+    if at < 0 or at + 12 > len(start):
+        return None
+    return int.from_bytes(start[at + 8 : at + 10], "big"), int.from_bytes(start[at + 10 : at + 12], "big")
 
 
 class ExrWindows(NamedTuple):

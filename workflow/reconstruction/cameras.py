@@ -88,13 +88,12 @@ class Sparse:
         return replace(self, camera_from_world=moved, points=(self.points @ turn.T + shift) * scale)
 
 
-def find_cameras(root: Path, names: Sequence[str], threads: int, colour: str, progress: Progress) -> Sparse:
-    """Find the cameras of photographs.
+def find_cameras(root: Path, names: Sequence[str], colour: str, progress: Progress) -> Sparse:
+    """Find the cameras of photographs, in one thread: which of several is the first to end would change numbers, and cameras.
 
     Args:
         root: folder that the names count from.
         names: of the photographs. Those of one size, model of camera and focal length by EXIF are of one camera.
-        threads: that may be used.
         colour: `source.colour`.
         progress: called with what is done, of how many, and what it is.
 
@@ -111,9 +110,9 @@ def find_cameras(root: Path, names: Sequence[str], threads: int, colour: str, pr
             sizes.append(_working_copy(root / name, work, number, cameras, colour))
             progress(number + 1, len(names), "photographs read")
         pycolmap.set_random_seed(_SEED)
-        _compare(database, work, len(names), threads, progress)
+        _compare(database, work, len(names), progress)
         options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads = 1  # sums of several threads differ from run to run
+        options.num_threads = 1
         options.random_seed = _SEED
         (Path(folder) / "sparse").mkdir()
         found = pycolmap.incremental_mapping(database, work, Path(folder) / "sparse", options)
@@ -129,7 +128,7 @@ def find_cameras(root: Path, names: Sequence[str], threads: int, colour: str, pr
     return _plain(most, names, sizes)
 
 
-def _compare(database: Path, work: Path, count: int, threads: int, progress: Progress) -> None:
+def _compare(database: Path, work: Path, count: int, progress: Progress) -> None:
     """Find features and matches of the working copies, into COLMAP's database."""
     import pycolmap
 
@@ -139,7 +138,7 @@ def _compare(database: Path, work: Path, count: int, threads: int, progress: Pro
         pycolmap.FeatureMatchingOptions(),
         pycolmap.ImageReaderOptions(),
     )
-    extraction.num_threads = matching.num_threads = threads
+    extraction.num_threads = matching.num_threads = 1
     extraction.sift.max_num_features = FEATURES
     reader.camera_model = "SIMPLE_RADIAL"
     by_folder = pycolmap.CameraMode.PER_FOLDER
@@ -151,9 +150,14 @@ def _compare(database: Path, work: Path, count: int, threads: int, progress: Pro
     if count <= EVERY_PAIR:
         pycolmap.match_exhaustive(database, matching_options=matching, device=cpu)
     else:
-        pairing = pycolmap.SequentialPairingOptions()
-        pairing.overlap = BESIDE
-        pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing, device=cpu)
+        # By number: COLMAP's own order is that of the folders, one for each camera.
+        copies = sorted(work.rglob("*.jpg"), key=lambda path: path.stem)
+        places = [path.relative_to(work).as_posix() for path in copies]
+        pairs = [f"{a} {b}" for i, a in enumerate(places) for b in places[i + 1 : i + 1 + BESIDE]]
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = str(database.with_name("pairs.txt"))
+        Path(pairing.match_list_path).write_text("\n".join(pairs) + "\n")
+        pycolmap.match_image_pairs(database, matching_options=matching, pairing_options=pairing, device=cpu)
     progress(0, count, "cameras placed")
 
 

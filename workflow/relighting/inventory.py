@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -57,11 +58,15 @@ class Inventory:
         return " + ".join(self.names[o] for o in lamp.objects) or f"lamp {lamp.emitter_id}"
 
     def lamps_called(self, key: str, where: str) -> list[int]:
-        """Return the places in `lamps` that a key of the settings means: one by its id, or all on objects of that name.
+        """Return the places in `lamps` that a key of the settings means: one by its id (`emitter 5`, or `5` where no object is
+        called so), or all on objects of that name.
 
         Raises:
             InputError: there is no such lamp, or the object does not shine; `where` is the setting, for the message.
         """
+        exact = re.fullmatch(r"emitter (\d+)", key)
+        if exact and any(lamp.emitter_id == int(exact[1]) for lamp in self.lamps):
+            return [i for i, lamp in enumerate(self.lamps) if lamp.emitter_id == int(exact[1])]
         by_name = [i for i, lamp in enumerate(self.lamps) if key in [self.names[o] for o in lamp.objects]]
         found = by_name or [i for i, lamp in enumerate(self.lamps) if key == str(lamp.emitter_id)]
         if found:
@@ -82,7 +87,7 @@ class Inventory:
             rest, own = (0.0, 1.0) if entry["each"] == "alone" else (1.0, 0.0)
             outside = "off" if entry["each"] == "alone" and entry["environment"] == "keep" else entry["environment"]
             for lamp in strongest:
-                lamps = {str(lamp.emitter_id): {"factor": own, "colour": None, "move": None}}
+                lamps = {f"emitter {lamp.emitter_id}": {"factor": own, "colour": None, "move": None}}
                 name = f"{entry['name']}_{lamp.emitter_id}"
                 out.append(entry | {"name": name, "each": None, "emitters": rest, "lamps": lamps, "environment": outside})
         return out

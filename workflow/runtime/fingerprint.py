@@ -49,6 +49,17 @@ NEEDED = tuple(stage.name for stage in STAGES.values() if not stage.on_demand)
 """Stages that every scene needs, in order."""
 
 
+def needed(scene: str, quality: str) -> tuple[str, ...]:
+    """Return the stages that a scene needs, in order: those of every scene, and what these read in scenes of its kind of source.
+
+    Raises:
+        InputError: the settings of the scene cannot be used.
+    """
+    document = parsed(resolved(scene, quality))
+    read = {up for stage in NEEDED for up in STAGES[stage].reads(document)}
+    return tuple(name for name, stage in STAGES.items() if name in read or not stage.on_demand)
+
+
 def module_file(module: str) -> Path | None:
     """Return the source file of one of our modules; None if there is no such module."""
     path = REPOSITORY.joinpath(*module.split("."))
@@ -283,7 +294,7 @@ def missing_stages(scene: str, quality: str) -> list[str]:
     Raises:
         InputError: the settings or the raw files of the scene cannot be used.
     """
-    return [stage for stage in NEEDED if _made(stage, scene, quality) != fingerprint(stage, scene, quality)]
+    return [stage for stage in needed(scene, quality) if _made(stage, scene, quality) != fingerprint(stage, scene, quality)]
 
 
 def _made(stage: str, scene: str, quality: str) -> str:

@@ -116,9 +116,9 @@ def wall(scene: str, quality: str, cores: int) -> Wall:
     """
     settings = fingerprints.parsed(fingerprints.resolved(scene, quality))
     rendered = plugins.function("SIZES", settings["source"]["kind"]) is not None
-    total = [START, START, START]
+    total, needed = [START, START, START], fingerprints.needed(scene, quality)
     for stage in STAGES.values():
-        if stage.on_demand or (stage.name == "capture" and rendered):
+        if stage.name not in needed or (stage.name == "capture" and rendered):
             continue
         threads = min(stage.threads, cores)
         cost = job_cost(stage.name, scene, quality, threads)
@@ -194,7 +194,8 @@ def _chain(seconds: Mapping[str, Range], bound: int) -> float:
     ends: dict[str, float] = {}
     for stage in STAGES.values():
         own = seconds[stage.name][bound] + START_OF_JOB if stage.name in seconds else 0.0
-        ends[stage.name] = own + max((ends[name] for name in stage.upstream), default=0.0)
+        before = (*stage.upstream, *(name for _, more in stage.also for name in more))
+        ends[stage.name] = own + max((ends[name] for name in before), default=0.0)
     return max(ends.values())
 
 

@@ -144,12 +144,12 @@ def dump(settings: SceneSettings) -> dict[str, Any]:
 
 
 def select(document: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
-    """Return the parts of a dumped settings tree that dotted `keys` name."""
+    """Return the parts of a dumped settings tree that dotted `keys` name; None for those that its kind of section has not."""
     out: dict[str, Any] = {}
     for key in keys:
         value: Any = document
         for part in key.split("."):
-            value = value[part]
+            value = value.get(part) if part not in value and "kind" in value else value[part]
         out[key] = value
     return out
 

@@ -91,6 +91,8 @@ class PhotographsSource(PhotographedSource):
     kind: Literal["photographs"]
     path: Path
     """Folder of the photographs; those in its folders count too."""
+    mesh_up: Literal["as_poses"] = "as_poses"
+    """The mesh that is found lies as the cameras do."""
     most: int = Field(120, ge=3, le=2000)
     """Largest number of photographs whose cameras are found, evenly spread by name; of those, `capture.views` are used for
     materials."""

@@ -370,10 +370,12 @@ def _checked_alignment(task: _Task, taken: _Taken) -> list[str]:
         return ["alignment was not checked (`source.alignment: off`)"]
     out, path = taken.aligned.notes(tolerance), task.inputs.cameras.path
     pairs = list(zip(taken.frames, taken.views, strict=True))
-    message = taken.aligned.refuse(path, tolerance, lambda: _better_depth(task, pairs))
+    alone = task.source.kind == "photographs"
+    poor = "The photographs tell too little of the room: take more of them, closer to each other, and of things with texture"
+    message = taken.aligned.refuse(path, tolerance, lambda: poor if alone else _better_depth(task, pairs))
     alignment.raise_or_note(message, mode, out)
     # Points by which the cameras themselves were found say more than edges, of which a mesh made from photographs has few.
-    by_points = task.inputs.cameras.known and len(taken.aligned.ratios) > 0
+    by_points = alone and 2 * len(taken.aligned.ratios) > len(taken.views)
     warning, better = "" if by_points else taken.aligned.edge_warning(tolerance), ""
     if warning and not taken.aligned.ratios:
         better = _better_edges(task, taken.trials, taken.aligned.report()["edge_correlation"])

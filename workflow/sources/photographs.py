@@ -11,11 +11,12 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.artifacts.store import StageReader
+from workflow.intake.names import same_name
 from workflow.runtime.job import Job
 from workflow.settings.source import FolderSource
 from workflow.sources import folder
 from workflow.sources.folder_scene import images, transforms
-from workflow.sources.folder_scene.entries import evenly_spread
+from workflow.sources.folder_scene.entries import evenly_spread, one_range
 from workflow.sources.folder_scene.frames import checked_frames, folder_at
 from workflow.sources.folder_scene.inputs import Inputs
 
@@ -35,7 +36,9 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
     if source["kind"] != "photographs":
         return []
     root = folder_at(source, "photographs")
-    return [root / name for name in chosen(root, source["most"])]
+    names = chosen(root, source["most"])
+    one_range(root, [root / name for name in names], document["capture"]["dynamic_range"])
+    return [root / name for name in names]
 
 
 def chosen(root: Path, most: int) -> list[str]:
@@ -45,14 +48,27 @@ def chosen(root: Path, most: int) -> list[str]:
         InputError: too few, or one that cannot be read.
     """
     found = sorted(path for path in root.rglob("*") if path.suffix.lower() in images.EXTENSIONS and path.is_file())
-    found = [path for path in found if "masks" not in path.relative_to(root).parts[:-1]]
+    found = [path for path in found if "masks" not in path.relative_to(root).parts[:-1] and not _hidden(path, root)]
     if len(found) < LEAST:
         kinds = ", ".join(images.EXTENSIONS)
         raise InputError(f"{root}: {len(found)} photographs ({kinds}); at least {LEAST} are needed, some dozens are better")
     taken = [found[i] for i in evenly_spread(len(found), most)]
+    seen: dict[tuple[str, str], Path] = {}
+    for path in taken:
+        other = seen.setdefault((path.parent.as_posix(), same_name(path.stem)), path)
+        if other is not path:
+            raise InputError(
+                f"{root}: {other.name} and {path.name} in {path.parent.name}/ would both be view {path.stem!r}; of a photograph"
+                " that is there in two formats, move one away, or rename it"
+            )
     for path in taken:
         images.header(path)
     return [path.relative_to(root).as_posix() for path in taken]
+
+
+def _hidden(path: Path, root: Path) -> bool:
+    """Return whether a name begins with a dot, as those of the files that macOS leaves beside others."""
+    return any(part.startswith(".") for part in path.relative_to(root).parts)
 
 
 def capture(job: Job) -> None:

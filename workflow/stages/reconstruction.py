@@ -14,6 +14,7 @@ from iif_core.reconstruction.fusing import fused_mesh
 from iif_core.reconstruction.neighbours import neighbours
 from iif_core.reconstruction.sweep import Picture, agreed, swept_depth
 from iif_core.reconstruction.walls import Walls, missing_walls
+from iif_core.surface.triangles import face_geometry
 from workflow.reconstruction.cameras import Sparse, find_cameras, picture_of
 from workflow.reconstruction.files import overview_png, ply_bytes, transforms_json
 from workflow.runtime.job import Job
@@ -29,6 +30,8 @@ AGREE = 2
 """Depth maps of other photographs that must have the same surface."""
 DOUBTFUL = 0.1
 """Share of a photograph whose depth others confirm, over the median of all, below which its camera is wrong."""
+LEAST_CONFIRMED = 0.1
+"""Least share of all pixels whose depth others confirm."""
 VOXELS = 2.0
 """Edge of a voxel in sizes of a pixel on the surface (median)."""
 
@@ -43,7 +46,7 @@ def run(job: Job) -> None:
     root = folder_at(vars(source), "photographs")
     names = chosen(root, source.most)
     with job.timed("cameras"):
-        sparse = find_cameras(root, names, job.threads, source.colour, job.progress)
+        sparse = find_cameras(root, names, source.colour, job.progress)
     job.log.info("%d of %d photographs have a camera; %d points", len(sparse.names), len(names), len(sparse.points))
     with job.timed("depth"):
         sparse, pictures, depths = _depths(job, sparse, root)
@@ -68,7 +71,7 @@ def run(job: Job) -> None:
         vertices = (vertices @ frame.turn.T + shift) * scale
         pictures = [p._replace(camera_from_world=c) for p, c in zip(pictures, sparse.camera_from_world, strict=True)]
         depths = [z * np.float32(scale) for z in depths]
-        walls = missing_walls(vertices, faces, depths, pictures)
+        walls = missing_walls(vertices, faces, depths, pictures, sparse.points)
     shares = [float(np.isfinite(z).mean()) for z in depths]
     facts = _facts(sparse, frame, scale, basis, walls, len(faces), VOXELS * float(footprint) * scale, shares)
     job.writer.bytes(CAMERAS, transforms_json(sparse))
@@ -110,10 +113,14 @@ def _depths(job: Job, sparse: Sparse, root: Path) -> tuple[Sparse, list[Picture]
         agreed(swept[view], pictures[view], [(swept[i], pictures[i]) for i in beside[view]], least=AGREE) for view in range(count)
     ]
     share = np.array([np.isfinite(depth).mean() for depth in depths])
-    gone = np.flatnonzero(share < DOUBTFUL * np.median(share))
+    if share.mean() < LEAST_CONFIRMED:
+        raise InputError(
+            f"{root}: photographs confirm each other's depth on {share.mean():.0%} of their pixels; a mesh needs at least"
+            f" {LEAST_CONFIRMED:.0%}. Take more of them, closer to each other, and of things with texture"
+            " (docs/guide/programs.md#photographs-alone)"
+        )
+    gone = np.flatnonzero((share < DOUBTFUL * np.median(share)) | (share == 0))
     kept = np.setdiff1d(np.arange(count), gone)
-    if not share[kept].any():
-        kept = kept[:0]
     why = "what it shows lies elsewhere in the others"
     return sparse.without(gone, why), [pictures[i] for i in kept], [depths[i] for i in kept]
 
@@ -139,7 +146,7 @@ def _metres(source: Any, frame: RoomFrame, sparse: Sparse) -> tuple[float, str]:
 def _facts(
     sparse: Sparse, frame: RoomFrame, scale: float, basis: str, walls: Walls, faces: int, voxel: float, shares: list[float]
 ) -> dict[str, Any]:
-    area = np.bincount(walls.side, minlength=len(walls.error)) * 0.5 * 0.01
+    area = np.bincount(walls.side, face_geometry(walls.vertices, walls.faces)[1], len(walls.error))
     planes = [
         {
             "normal": walls.sides.normal[i].round(4).tolist(),
@@ -157,8 +164,9 @@ def _facts(
         + (f", of which {len(known)} prolong surface to within {1000 * known.max():.2g} mm" if len(known) else ""),
         {
             "room_height": f"scale: the room is {(frame.ceiling - frame.floor) * scale:.3g} m high (source.room_height)",
-            "camera_height": "scale: guessed, from cameras that are held at source.camera_height; give source.room_height, the"
-            " height from floor to ceiling",
+            "camera_height": "scale: guessed, from cameras that are held at source.camera_height above the "
+            + ("floor" if frame.has_floor else "lowest surface, because no floor was found")
+            + ("; source.room_height, from floor to ceiling, is better" if frame.has_floor and frame.has_ceiling else ""),
         }[basis],
     ]
     if sparse.left_out:

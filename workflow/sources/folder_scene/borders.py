@@ -24,6 +24,8 @@ LEAST, LARGEST = 1e-3, 0.9
 """Share of a picture from which a border is one, and from which a photograph is black."""
 RIM, JPEG_RIM = 1, 4
 """Pixels by which a border is widened; JPEG mixes both sides within a block."""
+LOSSY = (".jpg", ".jpeg", ".heic", ".heif", ".avif", ".webp")
+"""Formats whose blocks smear an edge."""
 
 Size = tuple[int, int]
 
@@ -56,8 +58,8 @@ def find_borders(frames: Sequence[Frame], encoded: bool, read: Callable[[Frame],
                 break
         border = (count >= max(MOST * shown, FEWEST)) & ~is_lit
         if border.mean() >= LEAST:
-            is_jpeg = any(frame.image.suffix.lower() in (".jpg", ".jpeg") for frame in chosen)
-            found[size] = _widened(border, JPEG_RIM if is_jpeg else RIM)
+            is_lossy = any(frame.image.suffix.lower() in LOSSY for frame in chosen)
+            found[size] = _widened(border, JPEG_RIM if is_lossy else RIM)
     return found
 
 

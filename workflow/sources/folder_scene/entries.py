@@ -100,7 +100,7 @@ def locate(
     _unique_names(path, chosen)
     _all_present(path, root, [image for image in found.values() if not image.is_file()])  # another quality takes others
     located = [(entry, found[id(entry)]) for entry in chosen]
-    _one_range(path, [image for _, image in located], capture["dynamic_range"])
+    one_range(path, [image for _, image in located], capture["dynamic_range"])
     return located
 
 
@@ -208,7 +208,7 @@ def _elsewhere(path: Path, missing: Path) -> str:
     return ""
 
 
-def _one_range(path: Path, files: list[Path], dynamic_range: str) -> None:
+def one_range(path: Path, files: list[Path], dynamic_range: str) -> None:
     hdr = [f for f in files if f.suffix.lower() == ".exr"]
     if hdr and len(hdr) < len(files):
         other = next(f for f in files if f.suffix.lower() != ".exr")

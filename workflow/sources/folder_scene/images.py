@@ -93,13 +93,26 @@ def _header(path: Path, _stamp: tuple[int, int]) -> Header:
         with opened(path) as image:
             if image.mode not in MODES:
                 raise InputError(f"{path}: colour mode {image.mode}; allowed: grey, RGB, RGBA of 8 or 16 bits. Convert it")
+            if image.format == "TIFF" and getattr(image, "n_frames", 1) > 1:
+                _refuse_thumbnail(path)
             exif = image.getexif()
             orientation = exif.get(274, 1) or 1
-            turned = isinstance(orientation, int) and 1 <= orientation <= 8
+            # Pillow turns the pixels of a TIFF itself, and tells their size as turned.
+            turned = isinstance(orientation, int) and 1 <= orientation <= 8 and image.format != "TIFF"
             found = Header(image.size, orientation if turned else 1, _stated_exposure(exif.get_ifd(_PHOTO_IFD)))
         if not _complete(path):
             raise InputError(f"{path}: cut short (no end mark: an interrupted copy or download?); copy the file again")
     return found
+
+
+def _refuse_thumbnail(path: Path) -> None:
+    """Refuse a TIFF whose first picture, which is the one that is read, is not the largest."""
+    import tifffile
+
+    with tifffile.TiffFile(path) as file:
+        sizes = [page.size for page in file.pages]
+    if max(sizes) > sizes[0]:
+        raise InputError(f"{path}: {len(sizes)} pictures, of which the first is not the largest; save the photograph alone")
 
 
 def exif_upright(path: Path) -> tuple[bytes, tuple[str, float]]:
@@ -107,15 +120,29 @@ def exif_upright(path: Path) -> tuple[bytes, tuple[str, float]]:
     that of 35 mm film (else in mm, 0 = not stated)."""
     if path.suffix.lower() == ".exr":
         return b"", ("", 0.0)
+    from PIL import Image
+
     with reading(path, "not a readable image"), opened(path) as image:
-        exif = image.getexif()
-        exif[274] = 1
-        own = exif.get_ifd(_PHOTO_IFD)
-        try:
-            focal = float(own.get(41989) or own.get(37386) or 0.0)
-        except (TypeError, ValueError, ZeroDivisionError):
-            focal = 0.0
-        return exif.tobytes(), (str(exif.get(272, ""))[:100], focal if np.isfinite(focal) else 0.0)
+        found = image.getexif()
+        own = found.get_ifd(_PHOTO_IFD)
+        kept = Image.Exif()
+        kept[274] = 1
+        lens = {}
+        for tag in (41989, 37386):  # focal length as that of 35 mm film, and in mm
+            try:
+                value = float(own.get(tag) or 0.0)
+            except (TypeError, ValueError, ZeroDivisionError):
+                continue
+            if 0 < value < 10_000:
+                lens[tag] = value
+        for tag in (271, 272):  # make and model
+            if isinstance(found.get(tag), str):
+                kept[tag] = found[tag][:100]
+        if 41989 in lens:
+            kept.get_ifd(_PHOTO_IFD)[41989] = round(lens[41989])
+        if 37386 in lens:
+            kept.get_ifd(_PHOTO_IFD)[37386] = lens[37386]
+        return kept.tobytes(), (str(kept.get(272, "")), lens.get(41989, lens.get(37386, 0.0)))
 
 
 def _stated_exposure(photo: Mapping[int, Any]) -> Stated | None:
@@ -186,10 +213,23 @@ def _tiff_of_16_bits(path: Path) -> np.ndarray:
 
     with tifffile.TiffFile(path) as file:
         page = file.pages[0]
-        if page.compression not in (1, 5, 8, 32946, 32773):
-            raise InputError(f"{path}: a TIFF of 16 bits, compressed by {page.compression!s}; save it uncompressed or as PNG")
-        pixels = page.asarray()
-    return np.moveaxis(pixels, 0, -1) if page.planarconfig == 2 and pixels.ndim == 3 else pixels
+        if page.compression not in (1, 8, 32946, 32773):
+            kind = getattr(page.compression, "name", page.compression)
+            raise InputError(f"{path}: 16 bits compressed by {kind}, not read; save it uncompressed, by deflate, or as PNG")
+        pixels, extra = page.asarray(), tuple(page.extrasamples)
+        tag = page.tags.get(274)
+        turn = tag.value if tag is not None and tag.value in TURNS else 1
+        inverted = page.photometric == 0
+    pixels = np.moveaxis(pixels, 0, -1) if page.planarconfig == 2 and pixels.ndim == 3 else pixels
+    if extra and pixels.ndim == 3:
+        colours = pixels[..., : -len(extra)]
+        alpha = pixels[..., -len(extra)] if extra[0] in (1, 2) else None  # others are no opacity
+        if extra[0] == 1:  # colours multiplied by opacity
+            colours = np.minimum(colours * (65535.0 / np.maximum(alpha, 1))[..., None], 65535).astype(np.uint16)
+        pixels = colours if alpha is None else np.concatenate([colours, alpha[..., None]], -1)
+    if inverted:
+        pixels = np.concatenate([65535 - pixels[..., :1], pixels[..., 1:]], -1) if pixels.ndim == 3 else 65535 - pixels
+    return TURNS[turn](pixels)
 
 
 def _stored(path: Path) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.numerics.color import REC709_PRIMARIES, linear_from_srgb, rec709_from_primaries, srgb_from_linear
-from workflow.intake.pictures import png_chunk
+from workflow.intake.pictures import code_points, png_chunk
 
 SAME_LEVELS = 2
 """Levels of 255 by which a profile may differ from sRGB and still count as sRGB; profiles of sRGB round differently."""
@@ -124,8 +124,8 @@ def stated_space(image: Any, path: Path) -> tuple[Space | None, bool]:
     """Return the colour space that a picture states without an ICC profile, None where that is sRGB, or nothing is stated; and
     whether a profile would not count beside it.
 
-    A HEIF states it by its code points, a PNG by its chunk cICP, or without a profile and sRGB by gAMA and cHRM (PNG 3rd edition,
-    11.3.2); a JPEG of a camera by the interoperability index R03 of EXIF, which is Adobe RGB (DCF 2.0).
+    A HEIF or AVIF states it by its code points, a PNG by its chunk cICP, or without a profile and sRGB by gAMA and cHRM (PNG 3rd
+    edition, 11.3.2); a JPEG of a camera by the interoperability index R03 of EXIF, which is Adobe RGB (DCF 2.0).
 
     Raises:
         InputError: a transfer function or primaries that are not read, such as PQ and HLG.
@@ -136,10 +136,9 @@ def stated_space(image: Any, path: Path) -> tuple[Space | None, bool]:
     info = image.info
     if info.get("icc_profile") or "srgb" in info:
         return None, False
-    coded_heif = info.get("nclx_profile")
-    if coded_heif is not None:
-        points = coded_heif["color_primaries"], coded_heif["transfer_characteristics"]
-        return _by_code_points(path, bytes((*points, 0, 1))), True
+    points = code_points(path)
+    if points is not None:
+        return _by_code_points(path, bytes((*(min(number, 255) for number in points), 0, 1))), True
     gamma, white_first = info.get("gamma"), info.get("chromaticity")
     if gamma is not None or white_first is not None:
         usual = gamma is None or not 0.05 < gamma < 20 or abs(gamma - 1 / 2.2) <= SAME_GAMMA
