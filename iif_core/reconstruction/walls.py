@@ -102,6 +102,21 @@ def missing_walls(
     return Walls(placed, both, np.concatenate([side, side]), sides, error)
 
 
+def turn_to_walls(walls: Walls) -> NDArray:
+    """Return the rotation (3, 3) about z by which the largest upright side that prolongs a plane faces along x or y, by less than
+    half a right angle; the identity without one."""
+    upright = np.abs(walls.sides.normal[:, 2]) < 0.5
+    area = np.bincount(walls.sides.side, face_geometry(walls.sides.vertices, walls.sides.faces)[1], len(upright))
+    size = area * (upright & walls.sides.from_plane)
+    if not size.any():
+        return np.eye(3)
+    normal = walls.sides.normal[int(size.argmax())]
+    angle = np.arctan2(normal[1], normal[0])
+    off = angle - np.round(angle / (np.pi / 2)) * (np.pi / 2)
+    c, s = np.cos(off), np.sin(off)
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
 def _distance(vertices: NDArray, faces: NDArray, points: NDArray) -> NDArray:
     if not len(points):
         return np.zeros(0)

@@ -9,7 +9,7 @@ from iif_core.reconstruction.frame import room_frame
 from iif_core.reconstruction.fusing import fused_mesh, large_pieces
 from iif_core.reconstruction.neighbours import neighbours
 from iif_core.reconstruction.sweep import Picture, SweepOptions, agreed, swept_depth
-from iif_core.reconstruction.walls import missing_walls
+from iif_core.reconstruction.walls import missing_walls, turn_to_walls
 from iif_core.surface.triangles import face_geometry
 from tests.unit.test_enclosure import room
 
@@ -151,6 +151,17 @@ def test_walls_without_texture_are_built_and_doors_stay_open():
     assert area[of_door].sum() < 0.1 * 0.9 * 2.0
     assert (of_wall | of_door).mean() > 0.99
     assert np.nanmax(built.error) < 1e-3 and built.sides.from_plane.all()
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.06, -0.2, 0.7])
+def test_walls_are_turned_to_the_axes(angle):
+    vertices, faces = room(((2, 1),))
+    c, s = np.cos(angle), np.sin(angle)
+    turned = vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+    picture = Picture(np.zeros((4, 4), np.float32), INTRINSICS, looking((0.1, 0.2, 0.0), (1.0, 0.0, 0.0)))
+    walls = missing_walls(turned, faces, [np.full((4, 4), np.nan, np.float32)], [picture])
+    back = turned @ turn_to_walls(walls).T
+    np.testing.assert_allclose(np.sort(np.ptp(back, axis=0)), [2.5, 4.0, 5.0], atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(3))

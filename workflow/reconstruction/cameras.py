@@ -178,7 +178,7 @@ def _plain(model: Any, names: Sequence[str], sizes: Sequence[tuple[int, int]]) -
         point += seen
         view += [own] * len(seen)
     there = {place for place, _ in posed}
-    left_out = {name: "shares too little with the others" for i, name in enumerate(names) if i not in there}
+    left_out = {name: "it shares too little with the others" for i, name in enumerate(names) if i not in there}
     return Sparse(
         [names[place] for place, _ in posed],
         pinholes,

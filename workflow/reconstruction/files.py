@@ -49,8 +49,12 @@ def overview_png(
     above, below = figure.subfigures(2, 1, height_ratios=(3, 2))
     centre, ahead = sparse.world_from_camera[:, :3, 3], sparse.world_from_camera[:, :3, 2]
     dots = vertices[:: max(1, len(vertices) // _DOTS)]
-    added = walls.vertices[:: max(1, len(walls.vertices) // _DOTS)]
-    for axes, (i, j), title in zip(above.subplots(1, 2), ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
+    upright = np.abs(walls.sides.normal[walls.side, 2]) < 0.5
+    middle = walls.vertices[walls.faces].mean(1)
+    level = np.abs(walls.sides.normal[walls.side, 2]) >= 0.5
+    of_view = {"from above": middle[upright], "from the side": middle[level | (np.abs(walls.sides.normal[walls.side, 1]) < 0.5)]}
+    for axes, (i, j), title in zip(above.subplots(1, 2), ((0, 1), (0, 2)), of_view, strict=True):
+        added = of_view[title]
         axes.plot(added[:, i], added[:, j], ".", ms=1.5, color="tab:orange", alpha=0.4, label="added wall")
         axes.plot(dots[:, i], dots[:, j], ",", color="0.4", label="surface that photographs show")
         axes.quiver(centre[:, i], centre[:, j], ahead[:, i], ahead[:, j], color="tab:blue", width=0.003, label="camera")

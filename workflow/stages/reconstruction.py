@@ -13,7 +13,7 @@ from iif_core.reconstruction.frame import RoomFrame, room_frame
 from iif_core.reconstruction.fusing import fused_mesh
 from iif_core.reconstruction.neighbours import neighbours
 from iif_core.reconstruction.sweep import Picture, agreed, swept_depth
-from iif_core.reconstruction.walls import Walls, missing_walls
+from iif_core.reconstruction.walls import Walls, missing_walls, turn_to_walls
 from iif_core.surface.triangles import face_geometry
 from workflow.reconstruction.cameras import Sparse, find_cameras, picture_of
 from workflow.reconstruction.files import overview_png, ply_bytes, transforms_json
@@ -30,6 +30,8 @@ AGREE = 2
 """Depth maps of other photographs that must have the same surface."""
 DOUBTFUL = 0.1
 """Share of a photograph whose depth others confirm, over the median of all, below which its camera is wrong."""
+MANY = 0.1
+"""Share of photographs without a camera from which a person is warned."""
 LEAST_CONFIRMED = 0.1
 """Least share of all pixels whose depth others confirm."""
 VOXELS = 2.0
@@ -72,6 +74,11 @@ def run(job: Job) -> None:
         pictures = [p._replace(camera_from_world=c) for p, c in zip(pictures, sparse.camera_from_world, strict=True)]
         depths = [z * np.float32(scale) for z in depths]
         walls = missing_walls(vertices, faces, depths, pictures, sparse.points)
+        # Along the axes of the world, as fitted walls tell it better than the normals by which the frame was found.
+        turn = turn_to_walls(walls)
+        sparse, vertices = sparse.placed(turn, np.zeros(3), 1.0), vertices @ turn.T
+        walls = walls._replace(vertices=walls.vertices @ turn.T, sides=walls.sides._replace(normal=walls.sides.normal @ turn.T))
+        pictures = [p._replace(camera_from_world=c) for p, c in zip(pictures, sparse.camera_from_world, strict=True)]
     shares = [float(np.isfinite(z).mean()) for z in depths]
     facts = _facts(sparse, frame, scale, basis, walls, len(faces), VOXELS * float(footprint) * scale, shares)
     job.writer.bytes(CAMERAS, transforms_json(sparse))
@@ -121,7 +128,7 @@ def _depths(job: Job, sparse: Sparse, root: Path) -> tuple[Sparse, list[Picture]
         )
     gone = np.flatnonzero((share < DOUBTFUL * np.median(share)) | (share == 0))
     kept = np.setdiff1d(np.arange(count), gone)
-    why = "what it shows lies elsewhere in the others"
+    why = "its camera was placed wrongly, because others show something else there (repeated patterns, plain walls?)"
     return sparse.without(gone, why), [pictures[i] for i in kept], [depths[i] for i in kept]
 
 
@@ -169,9 +176,15 @@ def _facts(
             + ("; source.room_height, from floor to ceiling, is better" if frame.has_floor and frame.has_ceiling else ""),
         }[basis],
     ]
-    if sparse.left_out:
-        first = next(iter(sparse.left_out))
-        notes.append(f"{len(sparse.left_out)} photographs have no camera, such as {first}: {sparse.left_out[first]}")
+    for why in dict.fromkeys(sparse.left_out.values()):
+        names = [name for name, own in sparse.left_out.items() if own == why]
+        notes.append(f"{len(names)} photographs are left out, such as {names[0]}: {why}")
+    share = len(sparse.left_out) / (len(sparse.left_out) + len(sparse.names))
+    if share > MANY:
+        notes.append(
+            f"WARNING {share:.0%} of the photographs are left out: look for gaps and strays among the cameras in overview.png,"
+            " and take more photographs between those that are there"
+        )
     return {
         "photographs": len(sparse.names),
         "left_out": sparse.left_out,
