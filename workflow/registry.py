@@ -209,7 +209,7 @@ STAGES: dict[str, Stage] = {
             "room",
             "Write room.html: a page to walk through the room and to switch its lamps.",
             ("capture", "segmentation", "base", "emission", "second_look", "affines", "unwrap"),
-            ("room", "report.credit", "seed"),
+            ("room", "report.credit", "export.max_parts", "seed"),
             reads_raw=True,
             files=("workflow.room.sources", "workflow.decisions.held"),
             scores=True,

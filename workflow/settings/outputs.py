@@ -33,8 +33,8 @@ class Export(Section):
     max_faces_glb: int = Field(200_000, ge=1000)
     """Largest number of faces, about; a larger mesh is simplified."""
     max_parts: int = Field(200, ge=2)
-    """Largest number of meshes in `scene.glb`, `scene.usdc` and `mitsuba/`: the smallest pieces are joined to one. Lamps stay by
-    themselves, however many they are."""
+    """Largest number of meshes in `scene.glb`, `scene_unlit.glb`, `scene.usdc` and `mitsuba/`: the smallest pieces are joined to
+    one. Lamps stay by themselves, however many they are."""
     texture_size: int = Field(2048, ge=128, le=16384)
     """Largest side of the textures, in texels; smaller where the photographs show less. `export.json` says what it costs."""
     normal_map: bool = False

@@ -9,6 +9,7 @@ import numpy as np
 from iif_core.light.light_maps import to_half
 from workflow.exporters.atlas import bake, encoded, read_parts
 from workflow.exporters.glb import JPEG_QUALITY, glb_bytes
+from workflow.exporters.joining import joined
 from workflow.models.denoise import require_denoiser
 from workflow.room import build
 from workflow.room.contents import brightest, facts_of_objects, facts_of_part, page_that_fits, radiance_of_emitters
@@ -91,7 +92,8 @@ def run(job: Job) -> None:
     lit = unlit_picture(atlas, texels, total, exposure)
     provenance = {"scene": job.scene, "fingerprint": job.fingerprint, "exposure": exposure}
     shown = {"base_color": encoded(lit, JPEG_QUALITY)}
-    job.writer.bytes("scene_unlit.glb", glb_bytes(parts, shown, capture.up, provenance, capture.views, exposure))
+    taken = joined(parts, job.settings.export.max_parts)
+    job.writer.bytes("scene_unlit.glb", glb_bytes(taken, shown, capture.up, provenance, capture.views, exposure))
     page, width = page_that_fits(job, capture, frame, document, blobs)
     job.writer.bytes("room.html", page)
     facts = {

@@ -370,7 +370,7 @@ def _names(photos: Photographs, groups: EmitterGroups, family: np.ndarray, numbe
     own = np.flatnonzero(family == number)
     thing = int(photos.scene.object_id[np.flatnonzero(groups.of_face == own[0])[0]])
     name = photos.names[thing] if thing >= 0 else "surface of no object"
-    unseen = "unseen " if groups.is_hidden[own[0]] else ""
+    unseen = "unseen " if groups.is_hidden[own[0]] and not name.startswith("unseen ") else ""
     return f"{unseen}{name} ({groups.area[own].sum():.2g} m^2)"
 
 
