@@ -18,6 +18,9 @@ LEAST = 0.02
 """Least share of the area of a mesh that makes a plane of it."""
 BEYOND = 0.01
 """Largest share of the area that may lie behind a plane that bounds the room: what was scanned through a window."""
+SHOWN = 0.01
+"""Least share of points in a layer that tells how far a room reaches."""
+_MOST_LAYERS = 100_000
 _BINS = 32  # of normals, along each axis
 _SHIFTS, _FITS = 8, 6
 _DIRECTIONS = 24  # of planes that are looked at, the largest first
@@ -62,7 +65,8 @@ def enclosure(
         margin: distance (m) of the sides behind what they close, so that walls of the scan stay in front.
         beyond: largest share of the area that may lie behind a plane that bounds the room.
         noise: share of the area that is left out at each end of the extent; 0 = the extent of all vertices.
-        shown: (p, 3) further points of surface; sides at the extent lie behind all but one in a hundred of them.
+        shown: (p, 3) further points of surface, of which some may be far off; sides at the extent lie behind the outermost layer
+            that holds one in a hundred of them.
 
     Returns:
         The surface. It contains all points, and the scan but for what lies behind its planes and for noise.
@@ -89,7 +93,7 @@ def enclosure(
     extent = [_end(middle @ n, area, noise) if noise > 0 else (vertices[np.unique(faces)] @ n).max() for n in outward]
     bound = np.maximum(extent, (within @ outward.T).max(0)) if len(outward) else np.zeros(0)
     if shown is not None and len(np.asarray(shown)) and len(outward):
-        bound = np.maximum(bound, np.quantile(np.asarray(shown, np.float64) @ outward.T, 0.99, axis=0))
+        bound = np.maximum(bound, [_outermost(np.asarray(shown, np.float64) @ n) for n in outward])
 
     both = np.concatenate([found[:, :3], outward]), np.concatenate([found[:, 3], bound]) + margin
     return _polyhedron(*both, np.arange(len(both[0])) < len(found), within.mean(0))
@@ -160,6 +164,15 @@ def _end(place: NDArray, area: NDArray, noise: float) -> float:
     order = np.argsort(place)
     share = np.cumsum(area[order]) / area.sum()
     return float(place[order][min(np.searchsorted(share, 1.0 - noise), len(order) - 1)])
+
+
+def _outermost(place: NDArray) -> float:
+    """Return the end of the outermost layer, of two thicknesses `BESIDE`, that holds a share `SHOWN` of places (p,): points on a
+    wall lie together, those that are wrong lie apart."""
+    layer = ((place - place.min()) / (2 * BESIDE)).astype(np.int64)
+    layer = np.unique(layer, return_inverse=True)[1].ravel() if layer.max() > _MOST_LAYERS else layer
+    full = np.flatnonzero(np.bincount(layer) >= SHOWN * len(place))
+    return float(place[layer == full[-1]].max()) if len(full) else float(np.median(place))
 
 
 def _right_angled(directions: NDArray) -> NDArray:

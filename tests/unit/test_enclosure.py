@@ -92,6 +92,20 @@ def test_a_partition_is_no_wall_and_what_lies_behind_a_window_moves_none():
     assert boxed.vertices[:, 0].max() == pytest.approx(9.0 + MARGIN, abs=1e-6)
 
 
+def test_points_tell_how_far_the_room_reaches_and_stray_ones_do_not():
+    """Of the ceiling only points are known; two in a hundred points lie anywhere within 50 m."""
+    vertices, faces = room(((2, 1),))
+    low = vertices[faces].mean(1)[:, 2] < 0.2  # walls up to 1.45 m alone
+    rng = np.random.default_rng(0)
+    ceiling = np.column_stack([rng.uniform(-2, 2, (500, 2)), np.full(500, SIZE[2] / 2)]) + 0.01 * rng.normal(size=(500, 3))
+    stray = rng.uniform(-50, 50, (30, 3))
+    points = np.concatenate([ceiling, vertices, stray])
+    for kind in ("box", "planes"):
+        found = enclosure(vertices, faces[low], [[0.0, 0, -0.5]], kind, shown=points)
+        assert found.vertices[:, 2].max() == pytest.approx(SIZE[2] / 2, abs=0.08)
+        assert np.ptp(found.vertices[:, 0]) == pytest.approx(SIZE[0], abs=0.1)
+
+
 def test_no_wall_is_built_between_scan_and_cameras():
     vertices, faces = room(((0, 1),))
     outside = np.array([[-1.0, 0, 0], [6.0, 0, 0], [0.0, 0, 3.0]])

@@ -25,6 +25,9 @@ FEATURES = 4096
 EVERY_PAIR = 150
 """Photographs up to which each is compared with each; of more, each with those next to it in the order of their names."""
 BESIDE = 20
+INLIERS = 50, 0.4
+"""Points that must agree on the place of a photograph, and their share (COLMAP: 30 and 0.25): fewer agree on wrong places where
+bricks and tiles repeat."""
 LEAST, LEAST_SHARE = 3, 0.5
 """Photographs that must hang together, and share of all."""
 _SEED = 0
@@ -114,6 +117,7 @@ def find_cameras(root: Path, names: Sequence[str], colour: str, progress: Progre
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = 1
         options.random_seed = _SEED
+        options.mapper.abs_pose_min_num_inliers, options.mapper.abs_pose_min_inlier_ratio = INLIERS
         (Path(folder) / "sparse").mkdir()
         found = pycolmap.incremental_mapping(database, work, Path(folder) / "sparse", options)
     most = max(found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()), default=None)

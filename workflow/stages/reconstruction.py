@@ -28,7 +28,7 @@ LEAST_OF_MEDIAN = 0.05
 """Least depth that is searched, over the median."""
 AGREE = 2
 """Depth maps of other photographs that must have the same surface."""
-DOUBTFUL = 0.1
+DOUBTFUL = 0.2
 """Share of a photograph whose depth others confirm, over the median of all, below which its camera is wrong."""
 MANY = 0.1
 """Share of photographs without a camera from which a person is warned."""
