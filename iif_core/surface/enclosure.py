@@ -20,7 +20,6 @@ BEYOND = 0.01
 """Largest share of the area that may lie behind a plane that bounds the room: what was scanned through a window."""
 SHOWN = 0.01
 """Least share of points in a layer that tells how far a room reaches."""
-_MOST_LAYERS = 100_000
 _BINS = 32  # of normals, along each axis
 _SHIFTS, _FITS = 8, 6
 _DIRECTIONS = 24  # of planes that are looked at, the largest first
@@ -65,8 +64,8 @@ def enclosure(
         margin: distance (m) of the sides behind what they close, so that walls of the scan stay in front.
         beyond: largest share of the area that may lie behind a plane that bounds the room.
         noise: share of the area that is left out at each end of the extent; 0 = the extent of all vertices.
-        shown: (p, 3) further points of surface, of which some may be far off; sides at the extent lie behind the outermost layer
-            that holds one in a hundred of them.
+        shown: (p, 3) further points of surface, of which some may be far off; sides at the extent lie no nearer than the
+            outermost layer that holds one in a hundred of them.
 
     Returns:
         The surface. It contains all points, and the scan but for what lies behind its planes and for noise.
@@ -167,12 +166,12 @@ def _end(place: NDArray, area: NDArray, noise: float) -> float:
 
 
 def _outermost(place: NDArray) -> float:
-    """Return the end of the outermost layer, of two thicknesses `BESIDE`, that holds a share `SHOWN` of places (p,): points on a
+    """Return the middle of the outermost layer, of thickness `BESIDE`, that holds a share `SHOWN` of places (p,): points on a
     wall lie together, those that are wrong lie apart."""
-    layer = ((place - place.min()) / (2 * BESIDE)).astype(np.int64)
-    layer = np.unique(layer, return_inverse=True)[1].ravel() if layer.max() > _MOST_LAYERS else layer
+    layer = ((place - place.min()) / BESIDE).astype(np.int64)
+    layer = np.unique(layer, return_inverse=True)[1].ravel()  # however far the stray ones are
     full = np.flatnonzero(np.bincount(layer) >= SHOWN * len(place))
-    return float(place[layer == full[-1]].max()) if len(full) else float(np.median(place))
+    return float(np.median(place[layer == full[-1]] if len(full) else place))
 
 
 def _right_angled(directions: NDArray) -> NDArray:
