@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from iif_core.numerics.compiled import njit
 
 UNKNOWN = 255
 """Cost of a plane on which too few other photographs show a pixel."""
-_SCALE = 127.0  # levels of cost for a correlation of 0
 
 
 class Picture(NamedTuple):
@@ -36,6 +36,17 @@ class Picture(NamedTuple):
     def centre(self) -> NDArray:
         rotation, translation = self.camera_from_world[:, :3], self.camera_from_world[:, 3]
         return -rotation.T @ translation
+
+    def pixels(self, points: NDArray, shape: tuple[int, int]) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Return row and column (...) int64 of the pixel of a picture of a shape (H, W) that shows each point (..., 3) of the
+        world, 0 where none does, its z-depth (...), and (...) bool whether one does."""
+        local = points @ self.camera_from_world[:, :3].T + self.camera_from_world[:, 3]
+        depth, shown = local[..., 2], local @ self.intrinsics.T
+        with np.errstate(invalid="ignore", divide="ignore"):
+            x, y = shown[..., 0] / depth, shown[..., 1] / depth
+            inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
+        row, column = (np.where(inside, at, 0).astype(np.int64) for at in (y, x))
+        return row, column, depth, inside
 
 
 @dataclass(frozen=True)
@@ -78,8 +89,7 @@ def swept_depth(
     for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
         _add_path(cost, grey, dy, dx, options.step, options.jump, options.edge, total)
     place = _best(total, cost)
-    with np.errstate(divide="ignore"):
-        return (1.0 / np.interp(place, np.arange(options.planes), inverse)).astype(np.float32)
+    return (1.0 / np.interp(place, np.arange(options.planes), inverse)).astype(np.float32)
 
 
 def _homographies(reference: Picture, other: Picture, inverse: NDArray) -> NDArray:
@@ -97,11 +107,8 @@ def _costs(grey: NDArray, others: tuple[NDArray, ...], maps: NDArray, options: S
     """(H, W, planes) uint8 costs."""
     height, width = grey.shape
     cost = np.full((height, width, options.planes), UNKNOWN, np.uint8)
-    mean, square = np.empty_like(grey), np.empty_like(grey)
-    lines = np.empty_like(grey)
-    _box(grey, options.radius, lines, mean)
-    _box(grey * grey, options.radius, lines, square)
-    deviation = np.sqrt(np.maximum(square - mean * mean, 0.0)).astype(np.float32)
+    mean = _means(grey, options.radius)
+    deviation = np.sqrt(np.maximum(_means(grey.astype(np.float64) ** 2, options.radius) - mean**2, 0.0))
     scores = np.empty((len(others), height, width), np.float32)
     for plane in range(options.planes):
         for number, other in enumerate(others):
@@ -110,30 +117,12 @@ def _costs(grey: NDArray, others: tuple[NDArray, ...], maps: NDArray, options: S
     return cost
 
 
-@njit(fastmath=False)
-def _box(values: NDArray, radius: int, lines: NDArray, out: NDArray) -> None:
+def _means(values: NDArray, radius: int) -> NDArray:
     """Means (H, W) of windows of 2 radius + 1 pixels; at the border of those that exist."""
-    height, width = values.shape
-    for y in range(height):
-        total = 0.0
-        for x in range(min(radius, width)):
-            total += values[y, x]
-        for x in range(width):
-            if x + radius < width:
-                total += values[y, x + radius]
-            if x - radius - 1 >= 0:
-                total -= values[y, x - radius - 1]
-            lines[y, x] = total / (min(x + radius, width - 1) - max(x - radius, 0) + 1)
-    for x in range(width):
-        total = 0.0
-        for y in range(min(radius, height)):
-            total += lines[y, x]
-        for y in range(height):
-            if y + radius < height:
-                total += lines[y + radius, x]
-            if y - radius - 1 >= 0:
-                total -= lines[y - radius - 1, x]
-            out[y, x] = total / (min(y + radius, height - 1) - max(y - radius, 0) + 1)
+    total, count = (
+        uniform_filter(own.astype(np.float64), 2 * radius + 1, mode="constant") for own in (values, np.ones_like(values))
+    )
+    return total / count
 
 
 @njit()
@@ -315,12 +304,7 @@ def agreed(
     points = (rays * depth[..., None] - camera[:, 3]) @ camera[:, :3]
     count = np.zeros(depth.shape, np.int64)
     for other, picture in others:
-        local = points @ picture.camera_from_world[:, :3].T + picture.camera_from_world[:, 3]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            shown = local @ picture.intrinsics.T
-            x, y = shown[..., 0] / shown[..., 2], shown[..., 1] / shown[..., 2]
-            inside = (local[..., 2] > 0) & (x >= 0) & (y >= 0) & (x < other.shape[1]) & (y < other.shape[0])
-        i, j = (np.where(inside, a, 0).astype(np.int64) for a in (y, x))
+        row, column, z, inside = picture.pixels(points, other.shape)
         with np.errstate(invalid="ignore"):
-            count += inside & (np.abs(other[i, j] - local[..., 2]) <= tolerance * local[..., 2])
+            count += inside & (np.abs(other[row, column] - z) <= tolerance * z)
     return np.where(count >= least, depth, np.nan).astype(np.float32)

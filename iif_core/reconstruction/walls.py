@@ -23,7 +23,6 @@ RINGS = 2
 """Tiles by which they overlap."""
 THROUGH = 0.05
 """Share by which a depth map must look beyond a tile to say that nothing is there."""
-
 BEYOND = 0.05
 """Largest share of the area behind a wall: depth that is wrong."""
 NOISE = 0.005
@@ -46,6 +45,11 @@ class Walls(NamedTuple):
     sides: Enclosure
     error: NDArray
 
+    def turned(self, turn: NDArray) -> Walls:
+        """Return the same after a rotation (3, 3) of the world."""
+        sides = self.sides._replace(vertices=self.sides.vertices @ turn.T, normal=self.sides.normal @ turn.T)
+        return self._replace(vertices=self.vertices @ turn.T, sides=sides)
+
 
 def missing_walls(
     vertices: NDArray, faces: NDArray, depths: Sequence[NDArray], pictures: Sequence[Picture], points: NDArray | None = None
@@ -59,7 +63,7 @@ def missing_walls(
         vertices, faces: (n, 3), metres, and (m, 3), with an area.
         depths: (H, W) z-depth of each picture, NaN = unknown.
         pictures: their cameras.
-        points: (p, 3) that photographs show: where no plane is, sides are built behind nearly all of them.
+        points: (p, 3) that photographs show: where no plane is, sides go at least as far as most of the outermost ones.
     """
     centres = np.array([picture.centre for picture in pictures])
     sides = enclosure(vertices, faces, centres, "planes", margin=0.0, beyond=BEYOND, noise=NOISE, shown=points)
@@ -76,25 +80,25 @@ def missing_walls(
             shift = float(np.average(away[own], weights=area[own])) if area[own].sum() > 0 else 0.0
             error[number] = np.sqrt(np.average((away[own] - shift) ** 2, weights=area[own])) if area[own].sum() > 0 else np.nan
             outline = outline + shift * inward
-        grid, quads = _tiles(outline, inward)
-        tiles.append(quads + sum(map(len, corners)))
-        corners.append(grid)
-        of_side.append(np.full(len(quads), number))
-    points, quads, side = np.concatenate(corners), np.concatenate(tiles), np.concatenate(of_side)
-    centre = points[quads].mean(1)
+        own_corners, own_tiles = _tiles(outline, inward)
+        tiles.append(own_tiles + sum(map(len, corners)))
+        corners.append(own_corners)
+        of_side.append(np.full(len(own_tiles), number))
+    grid, quads, side = np.concatenate(corners), np.concatenate(tiles), np.concatenate(of_side)
+    centre = grid[quads].mean(1)
     away = _distance(vertices, faces, centre)
     lacks = (away > NEAR) & ~_seen_through(centre, depths, pictures)
 
     # -------- tiles beside those that are lacking overlap with the mesh, behind it --------
     kept = lacks.copy()
     for _ in range(RINGS):
-        touched = np.zeros(len(points), bool)
+        touched = np.zeros(len(grid), bool)
         touched[quads[kept]] = True
         kept |= (away <= NEAR) & touched[quads].any(1)
     quads, side = quads[kept], side[kept]
     used, first, local = np.unique(quads, return_index=True, return_inverse=True)
     of_corner = side[first // 4]
-    placed = points[used]
+    placed = grid[used]
     back = np.where(np.isnan(error), BEHIND, np.maximum(2 * np.nan_to_num(error), BEHIND))[of_corner]
     placed = placed - (back * (_distance(vertices, faces, placed) <= NEAR))[:, None] * sides.normal[of_corner]
     local = local.reshape(-1, 4)
@@ -153,12 +157,7 @@ def _seen_through(points: NDArray, depths: Sequence[NDArray], pictures: Sequence
     """(n,) bool: at least two depth maps show something well behind a point."""
     count = np.zeros(len(points), np.int64)
     for depth, picture in zip(depths, pictures, strict=True):
-        local = points @ picture.camera_from_world[:, :3].T + picture.camera_from_world[:, 3]
-        shown = local @ picture.intrinsics.T
-        with np.errstate(invalid="ignore", divide="ignore"):
-            x, y = shown[:, 0] / shown[:, 2], shown[:, 1] / shown[:, 2]
-            inside = (local[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < depth.shape[1]) & (y < depth.shape[0])
-        j, i = (np.where(inside, k, 0).astype(np.int64) for k in (x, y))
+        row, column, z, inside = picture.pixels(points, depth.shape)
         with np.errstate(invalid="ignore"):
-            count += inside & (depth[i, j] > (1 + THROUGH) * local[:, 2] + NEAR)
+            count += inside & (depth[row, column] > (1 + THROUGH) * z + NEAR)
     return count >= 2

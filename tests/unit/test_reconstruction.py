@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from iif_core.reconstruction.frame import room_frame
@@ -33,11 +33,7 @@ def depth_on(pose, normal=SLOPE, offset=3.0):
 def photograph(pose, gain=1.0, **plane):
     """The textured wall, one texel a centimetre."""
     _, points = depth_on(pose, **plane)
-    fine = (points[..., :2] / 0.01) - np.floor(points[..., :2] / 0.01)
-    i, j = np.floor(points[..., 0] / 0.01).astype(int), np.floor(points[..., 1] / 0.01).astype(int)
-    a, b = fine[..., 0], fine[..., 1]
-    corner = lambda di, dj: TEXTURE[(i + di) % 800, (j + dj) % 800]  # noqa: E731
-    shown = (1 - a) * ((1 - b) * corner(0, 0) + b * corner(0, 1)) + a * ((1 - b) * corner(1, 0) + b * corner(1, 1))
+    shown = map_coordinates(TEXTURE, np.moveaxis(points[..., :2] / 0.01, -1, 0), order=1, mode="grid-wrap")
     return Picture((gain * shown).astype(np.float32), INTRINSICS, pose)
 
 

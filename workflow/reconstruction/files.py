@@ -27,16 +27,6 @@ def transforms_json(sparse: Sparse) -> bytes:
     return (json.dumps(document, indent=1) + "\n").encode()
 
 
-def ply_bytes(vertices: np.ndarray, faces: np.ndarray) -> bytes:
-    """Return a binary PLY of a mesh."""
-    rows = np.zeros(len(faces), np.dtype([("count", "u1"), ("corner", "<i4", 3)]))
-    rows["count"], rows["corner"] = 3, faces
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property float {name}" for name in "xyz"]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
-    return "\n".join(header).encode() + np.ascontiguousarray(vertices, "<f4").tobytes() + rows.tobytes()
-
-
 def overview_png(
     sparse: Sparse, vertices: np.ndarray, walls: Walls, pictures: Sequence[Picture], depths: Sequence[np.ndarray]
 ) -> bytes:

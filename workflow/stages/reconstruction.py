@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from iif_core.errors import InputError
 from iif_core.numerics.parallel import map_in_order
@@ -16,7 +17,7 @@ from iif_core.reconstruction.sweep import Picture, agreed, swept_depth
 from iif_core.reconstruction.walls import Walls, missing_walls, turn_to_walls
 from iif_core.surface.triangles import face_geometry
 from workflow.reconstruction.cameras import Sparse, find_cameras, picture_of
-from workflow.reconstruction.files import overview_png, ply_bytes, transforms_json
+from workflow.reconstruction.files import overview_png, transforms_json
 from workflow.runtime.job import Job
 from workflow.sources.folder_scene.frames import folder_at
 from workflow.sources.folder_scene.mesh import DIAGONAL
@@ -29,7 +30,7 @@ LEAST_OF_MEDIAN = 0.05
 AGREE = 2
 """Depth maps of other photographs that must have the same surface."""
 DOUBTFUL = 0.2
-"""Share of a photograph whose depth others confirm, over the median of all, below which its camera is wrong."""
+"""Share of a photograph whose depth others confirm, over the median of all, below which its camera is taken for wrong."""
 MANY = 0.1
 """Share of photographs without a camera from which a person is warned."""
 LEAST_CONFIRMED = 0.1
@@ -76,15 +77,13 @@ def run(job: Job) -> None:
         walls = missing_walls(vertices, faces, depths, pictures, sparse.points)
         # Along the axes of the world, as fitted walls tell it better than the normals by which the frame was found.
         turn = turn_to_walls(walls)
-        sparse, vertices = sparse.placed(turn, np.zeros(3), 1.0), vertices @ turn.T
-        walls = walls._replace(vertices=walls.vertices @ turn.T, sides=walls.sides._replace(normal=walls.sides.normal @ turn.T))
+        sparse, vertices, walls = sparse.placed(turn, np.zeros(3), 1.0), vertices @ turn.T, walls.turned(turn)
         pictures = [p._replace(camera_from_world=c) for p, c in zip(pictures, sparse.camera_from_world, strict=True)]
     shares = [float(np.isfinite(z).mean()) for z in depths]
     facts = _facts(sparse, frame, scale, basis, walls, len(faces), VOXELS * float(footprint) * scale, shares)
     job.writer.bytes(CAMERAS, transforms_json(sparse))
-    job.writer.bytes(
-        MESH, ply_bytes(np.concatenate([vertices, walls.vertices]), np.concatenate([faces, walls.faces + len(vertices)]))
-    )
+    both = np.concatenate([vertices, walls.vertices]), np.concatenate([faces, walls.faces + len(vertices)])
+    job.writer.bytes(MESH, trimesh.Trimesh(*both, process=False).export(file_type="ply"))
     seen = sparse.points[sparse.point].astype(np.float32)
     columns = {name: seen[:, i] for i, name in enumerate("xyz")}
     job.writer.table(POINTS, columns | {"view": sparse.view.astype(np.int32)}, dict.fromkeys("xyz", "m"))
@@ -128,7 +127,7 @@ def _depths(job: Job, sparse: Sparse, root: Path) -> tuple[Sparse, list[Picture]
         )
     gone = np.flatnonzero((share < DOUBTFUL * np.median(share)) | (share == 0))
     kept = np.setdiff1d(np.arange(count), gone)
-    why = "its camera was placed wrongly, because others show something else there (repeated patterns, plain walls?)"
+    why = "others hardly confirm its depth: its camera may be placed wrongly (repeated patterns), or it shows plain walls"
     return sparse.without(gone, why), [pictures[i] for i in kept], [depths[i] for i in kept]
 
 
