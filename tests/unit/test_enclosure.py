@@ -106,6 +106,24 @@ def test_points_tell_how_far_the_room_reaches_and_stray_ones_do_not():
         assert np.ptp(found.vertices[:, 0]) == pytest.approx(SIZE[0], abs=0.1)
 
 
+def test_the_box_lies_along_most_of_the_surface():
+    """A slanted plate in the room is the least of its directions."""
+    vertices, faces = room(((2, 1),))
+    turn = Rotation.from_euler("z", 0.4).as_matrix()
+    plate = np.array([[-0.5, -0.5, -0.2], [0.5, -0.5, -0.2], [0.5, 0.5, 0.5], [-0.5, 0.5, 0.5]])
+    both = np.concatenate([vertices @ turn.T, plate])
+    found = enclosure(both, np.concatenate([faces, [[0, 1, 2], [0, 2, 3]] + np.array(len(vertices))]), [[0.0, 0, 0]], "box")
+    assert volume(found) == pytest.approx(np.prod(SIZE + 2 * MARGIN), rel=1e-6)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_single_wall_gives_a_box(axis):
+    wall = np.roll(np.array([[0.0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]]), axis, axis=1)
+    camera = np.roll([1.0, 0, 0], axis)
+    found = enclosure(wall, [[0, 1, 2], [0, 2, 3]], [camera], "box")
+    assert is_closed(found) and volume(found) == pytest.approx((1 + 2 * MARGIN) * (2 + 2 * MARGIN) ** 2, rel=1e-6)
+
+
 def test_no_wall_is_built_between_scan_and_cameras():
     vertices, faces = room(((0, 1),))
     outside = np.array([[-1.0, 0, 0], [6.0, 0, 0], [0.0, 0, 3.0]])

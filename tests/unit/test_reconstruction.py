@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from iif_core.reconstruction.frame import room_frame
 from iif_core.reconstruction.fusing import fused_mesh, large_pieces
 from iif_core.reconstruction.neighbours import neighbours
-from iif_core.reconstruction.sweep import Picture, SweepOptions, agreed, swept_depth
+from iif_core.reconstruction.sweep import Picture, SweepOptions, _add_path, agreed, swept_depth
 from iif_core.reconstruction.walls import missing_walls, turn_to_walls
 from iif_core.surface.triangles import face_geometry
 from tests.unit.test_enclosure import room
@@ -58,6 +58,37 @@ def test_depth_of_a_slanted_wall_between_exposures():
     assert np.nanmedian(error) < 0.25 * step and np.nanquantile(error, 0.95) < step
     one = swept_depth(pictures[0], pictures[1:2], 1.5, 6.0, options)
     assert not np.isfinite(one).any()
+
+
+def gathered(cost, grey, dy, dx, step, jump, edge):
+    """Eq. D.2 in one direction, written down pixel by pixel in double precision."""
+    height, width, planes = cost.shape
+    known = np.where(cost == 255, 127.0, cost)
+    out = np.zeros(cost.shape)
+    rows = range(height) if dy >= 0 else range(height - 1, -1, -1)
+    columns = range(width) if dx >= 0 else range(width - 1, -1, -1)
+    for y in rows:
+        for x in columns:
+            i, j = y - dy, x - dx
+            out[y, x] = known[y, x]
+            if 0 <= i < height and 0 <= j < width:
+                before = out[i, j]
+                limit = max(jump / (1 + abs(float(grey[y, x]) - float(grey[i, j])) / edge), step)
+                beside = np.minimum(np.r_[np.inf, before[:-1]], np.r_[before[1:], np.inf]) + step
+                out[y, x] += np.minimum(np.minimum(before, beside), before.min() + limit) - before.min()
+    return out
+
+
+@pytest.mark.parametrize("direction", [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)])
+def test_gathered_costs_are_those_of_the_formula(direction):
+    rng = np.random.default_rng(2)
+    cost = rng.integers(0, 256, (6, 7, 5), np.uint8)
+    cost[2, 3] = 255
+    grey = rng.random((6, 7)).astype(np.float32)
+    total = np.zeros(cost.shape, np.uint16)
+    _add_path(cost, grey, *direction, 12.0, 120.0, 0.2, total)
+    expected = gathered(cost, grey, *direction, 12.0, 120.0, 0.2)
+    assert np.abs(total - expected).max() <= 1.0  # whole levels are added
 
 
 def test_a_camera_somewhere_else_tells_nothing():
