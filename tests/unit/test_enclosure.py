@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from iif_core.surface.enclosure import enclosure
+from iif_core.surface.enclosure import directions, enclosure
 from iif_core.surface.triangles import face_geometry
 from tests.unit import own_scene as own
 
@@ -114,6 +114,19 @@ def test_the_box_lies_along_most_of_the_surface():
     both = np.concatenate([vertices @ turn.T, plate])
     found = enclosure(both, np.concatenate([faces, [[0, 1, 2], [0, 2, 3]] + np.array(len(vertices))]), [[0.0, 0, 0]], "box")
     assert volume(found) == pytest.approx(np.prod(SIZE + 2 * MARGIN), rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_direction_is_the_middle_of_normals_that_scatter(seed):
+    """Six tenths of the faces scatter by 4 degrees, either way round; the others look anywhere."""
+    rng = np.random.default_rng(seed)
+    truth = rng.normal(size=3)
+    truth /= np.linalg.norm(truth)
+    near = truth + np.tan(np.radians(4.0)) * rng.normal(size=(1200, 3)) / np.sqrt(2)
+    normal = np.concatenate([near * rng.choice([-1, 1], (1200, 1)), rng.normal(size=(800, 3))])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    found = directions(normal, np.ones(len(normal)))[0]
+    assert abs(found @ truth) > np.cos(np.radians(0.7))
 
 
 @pytest.mark.parametrize("axis", range(3))
