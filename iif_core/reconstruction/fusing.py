@@ -62,13 +62,19 @@ def fused_mesh(depths: Sequence[NDArray], pictures: Sequence[Picture], voxel: fl
     return large_pieces(np.asarray(smooth.vertices, np.float64), np.asarray(smooth.triangles, np.int64))
 
 
-def large_pieces(vertices: NDArray, faces: NDArray, least: float = LEAST_AREA) -> tuple[NDArray, NDArray]:
-    """Return the mesh without pieces that hang together and have less than a share `least` of the area."""
+def large_pieces(vertices: NDArray, faces: NDArray, among: NDArray | None = None) -> tuple[NDArray, NDArray]:
+    """Return a mesh without pieces that hang together and have less than `LEAST_AREA` of its area.
+
+    among: (m,) bool, faces of the mesh that are left; None = all.
+    """
     if not len(faces):
         return vertices[:0], faces
-    piece = component_labels(len(vertices), faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())[faces[:, 0]]
     area = face_geometry(vertices, faces)[1]
+    least = LEAST_AREA * area.sum()
+    if among is not None:
+        faces, area = faces[among], area[among]
+    piece = component_labels(len(vertices), faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())[faces[:, 0]]
     of_piece = np.bincount(piece, area)
-    kept = faces[of_piece[piece] >= least * area.sum()]
+    kept = faces[of_piece[piece] >= least]
     used, local = np.unique(kept, return_inverse=True)
     return vertices[used], local.reshape(-1, 3)

@@ -17,6 +17,8 @@ from iif_core.numerics.compiled import njit
 
 UNKNOWN = 255
 """Cost of a plane on which too few other photographs show a pixel."""
+REACH = 4
+"""Steps to either side of what was found, in each of the finer searches."""
 
 
 class Picture(NamedTuple):
@@ -61,6 +63,9 @@ class SweepOptions:
         step, jump: costs of a change of depth by one plane and by more between neighbours, in levels of cost (127 =
             uncorrelated).
         edge: difference of grey between neighbours that halves `jump`.
+        finer: steps of the searches that follow, about what was found, over that between planes.
+        keeps: by how much the correlation must be larger at the end of such a search: plain surface stays where its neighbours
+            put it.
     """
 
     planes: int = 96
@@ -69,6 +74,8 @@ class SweepOptions:
     step: float = 12.0
     jump: float = 120.0
     edge: float = 0.2
+    finer: tuple[float, ...] = (0.25, 0.08)
+    keeps: float = 0.1
 
 
 def swept_depth(
@@ -82,39 +89,96 @@ def swept_depth(
         near, far: least and largest depth.
     """
     inverse = np.linspace(1.0 / far, 1.0 / near, options.planes)
-    maps = np.stack([_homographies(reference, other, inverse) for other in others])
-    grey = np.ascontiguousarray(reference.grey, np.float32)
-    cost = _costs(grey, tuple(np.ascontiguousarray(o.grey, np.float32) for o in others), maps, options)
+    compared = _Compared.of(reference, others, options.radius)
+    grey = compared.grey
+    cost = _costs(compared, inverse, options.least)
     total = np.zeros(cost.shape, np.uint16)
     for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
         _add_path(cost, grey, dy, dx, options.step, options.jump, options.edge, total)
     place = _best(total, cost)
-    return (1.0 / np.interp(place, np.arange(options.planes), inverse)).astype(np.float32)
+    found = np.interp(place, np.arange(options.planes), inverse)
+    for part in options.finer if len(others) >= options.least else ():
+        found = _refined(compared, found, part * (inverse[1] - inverse[0]), options.least, options.keeps)
+    return (1.0 / found).astype(np.float32)
 
 
-def _homographies(reference: Picture, other: Picture, inverse: NDArray) -> NDArray:
-    """(planes, 3, 3) float64: pixel of the reference -> pixel of the other, by the planes z = 1 / inverse of the reference
-    (Eq. D.1).
+class _Compared(NamedTuple):
+    """A photograph and those that it is compared with.
+
+    Attributes:
+        grey: (H, W) float32; mean, deviation: (H, W) of its windows, whose radius is `radius`.
+        others: of each other photograph grey, and K' R K^-1 (3, 3) and K' t (3,) of Eq. D.1.
     """
-    rotation, translation = reference.camera_from_world[:, :3], reference.camera_from_world[:, 3]
-    turn = other.camera_from_world[:, :3] @ rotation.T
-    move = other.camera_from_world[:, 3] - turn @ translation
-    plane = np.outer(move, [0.0, 0.0, 1.0])
-    return other.intrinsics @ (turn + inverse[:, None, None] * plane) @ np.linalg.inv(reference.intrinsics)
+
+    grey: NDArray
+    mean: NDArray
+    deviation: NDArray
+    radius: int
+    others: list[tuple[NDArray, NDArray, NDArray]]
+
+    @classmethod
+    def of(cls, reference: Picture, others: Sequence[Picture], radius: int) -> _Compared:
+        grey = np.ascontiguousarray(reference.grey, np.float32)
+        mean = _means(grey, radius)
+        deviation = np.sqrt(np.maximum(_means(grey.astype(np.float64) ** 2, radius) - mean**2, 0.0))
+        rotation, translation = reference.camera_from_world[:, :3], reference.camera_from_world[:, 3]
+        seen = []
+        for other in others:
+            turn = other.camera_from_world[:, :3] @ rotation.T
+            move = other.camera_from_world[:, 3] - turn @ translation
+            far = other.intrinsics @ turn @ np.linalg.inv(reference.intrinsics)
+            seen.append((np.ascontiguousarray(other.grey, np.float32), far, other.intrinsics @ move))
+        return cls(grey, mean, deviation, radius, seen)
+
+    def scores(self, inverse: NDArray, out: NDArray) -> None:
+        """Correlate with each other photograph, (others, H, W), at inverse depths (H, W)."""
+        for (other, turn, move), score in zip(self.others, out, strict=True):
+            _correlate(self.grey, self.mean, self.deviation, other, turn, move, inverse, self.radius, score)
 
 
-def _costs(grey: NDArray, others: tuple[NDArray, ...], maps: NDArray, options: SweepOptions) -> NDArray:
+def _costs(compared: _Compared, inverse: NDArray, least: int) -> NDArray:
     """(H, W, planes) uint8 costs."""
-    height, width = grey.shape
-    cost = np.full((height, width, options.planes), UNKNOWN, np.uint8)
-    mean = _means(grey, options.radius)
-    deviation = np.sqrt(np.maximum(_means(grey.astype(np.float64) ** 2, options.radius) - mean**2, 0.0))
-    scores = np.empty((len(others), height, width), np.float32)
-    for plane in range(options.planes):
-        for number, other in enumerate(others):
-            _correlate(grey, mean, deviation, other, maps[number, plane], options.radius, scores[number])
-        _merge(scores, options.least, plane, cost)
+    shape = compared.grey.shape
+    cost = np.full((*shape, len(inverse)), UNKNOWN, np.uint8)
+    scores = np.empty((len(compared.others), *shape), np.float32)
+    for plane, value in enumerate(inverse):
+        compared.scores(np.full(shape, value), scores)
+        _merge(scores, least, plane, cost)
     return cost
+
+
+def _refined(compared: _Compared, found: NDArray, step: float, least: int, keeps: float) -> NDArray:
+    """Search inverse depths (H, W) again, by `step`, about those that were found (Eq. D.3).
+
+    Windows lie on the surface that was found, and not on planes in front of the photograph, so that it may be slanted.
+    """
+    base = _smooth(found, REACH * step)
+    offsets = np.arange(-REACH, REACH + 1)
+    scores = np.empty((len(compared.others), *base.shape), np.float32)
+    alike = np.empty((len(offsets), *base.shape), np.float32)
+    for k, offset in enumerate(offsets):
+        compared.scores(base + offset * step, scores)
+        alike[k] = np.partition(scores, -least, 0)[-least:].mean(0) - keeps * (offset / REACH) ** 2
+    best = np.clip(alike.argmax(0), 1, len(offsets) - 2)
+    before, here, after = (np.take_along_axis(alike, (best + i)[None], 0)[0] for i in (-1, 0, 1))
+    bend = before - 2 * here + after
+    between = np.divide(before - after, 2 * bend, out=np.zeros(bend.shape, np.float32), where=bend < 0)
+    return base + (offsets[best] + np.clip(between, -1.0, 1.0)) * step
+
+
+def _smooth(values: NDArray, reach: float, radius: int = 2) -> NDArray:
+    """Means (H, W) over windows of what differs from their middle by at most `reach`; NaN stays."""
+    height, width = values.shape
+    wide = np.pad(values, radius, constant_values=np.nan)
+    total, count = np.zeros(values.shape), np.zeros(values.shape)
+    for dy in range(2 * radius + 1):
+        for dx in range(2 * radius + 1):
+            own = wide[dy : dy + height, dx : dx + width]
+            with np.errstate(invalid="ignore"):
+                near = np.abs(own - values) <= reach
+            total += np.where(near, own, 0.0)
+            count += near
+    return np.divide(total, count, out=np.full(values.shape, np.nan), where=count > 0)
 
 
 def _means(values: NDArray, radius: int) -> NDArray:
@@ -127,26 +191,36 @@ def _means(values: NDArray, radius: int) -> NDArray:
 
 @njit()
 def _correlate(
-    grey: NDArray, mean: NDArray, deviation: NDArray, other: NDArray, homography: NDArray, radius: int, score: NDArray
+    grey: NDArray,
+    mean: NDArray,
+    deviation: NDArray,
+    other: NDArray,
+    turn: NDArray,
+    move: NDArray,
+    inverse: NDArray,
+    radius: int,
+    score: NDArray,
 ) -> None:
-    """Correlation (H, W) of each window with what another photograph shows on one plane; -2 where it does not show all of it."""
+    """Correlation (H, W) of each window with what another photograph shows at inverse depths (H, W); -2 where it does not show
+    all of it."""
     height, width = grey.shape
     rows, columns = other.shape
     warped = np.empty((height, width), np.float32)
     known = np.empty((height, width), np.float32)
-    h = homography
+    h = turn
 
-    # -------- what the other photograph shows on the plane, between its pixels --------
+    # -------- what the other photograph shows at these depths, between its pixels --------
     for y in range(height):
         for x in range(width):
             u, v = x + 0.5, y + 0.5
-            w = h[2, 0] * u + h[2, 1] * v + h[2, 2]
+            q = inverse[y, x]
+            w = h[2, 0] * u + h[2, 1] * v + h[2, 2] + q * move[2]
             known[y, x] = 0.0
             warped[y, x] = 0.0
-            if w <= 1e-9:
+            if not w > 1e-9:  # a depth that is unknown too
                 continue
-            px = (h[0, 0] * u + h[0, 1] * v + h[0, 2]) / w - 0.5
-            py = (h[1, 0] * u + h[1, 1] * v + h[1, 2]) / w - 0.5
+            px = (h[0, 0] * u + h[0, 1] * v + h[0, 2] + q * move[0]) / w - 0.5
+            py = (h[1, 0] * u + h[1, 1] * v + h[1, 2] + q * move[1]) / w - 0.5
             if px < 0.0 or py < 0.0 or px > columns - 1.001 or py > rows - 1.001:
                 continue
             i, j = int(py), int(px)

@@ -1,4 +1,5 @@
-"""Flat walls, floor and ceiling where depth maps found nothing, because a wall without texture looks the same everywhere."""
+"""Flat walls, floor and ceiling: in the place of the surface that lies on them, whose noise would turn its normals, and where
+depth maps found nothing, because a wall without texture looks the same everywhere."""
 
 from __future__ import annotations
 
@@ -10,17 +11,25 @@ from numpy.typing import NDArray
 
 from iif_core.reconstruction.sweep import Picture
 from iif_core.surface.closest import closest_points
-from iif_core.surface.enclosure import BESIDE, Enclosure, enclosure
+from iif_core.surface.enclosure import BESIDE, Enclosure, enclosure, moved
 from iif_core.surface.triangles import face_geometry
 
-TILE = 0.1
-"""Edge (m) of the squares of which walls are made."""
+TILE = 0.04
+"""Edge (m) of the squares of which walls are made: what is painted on them is told apart by squares."""
+MOST_TILES = 200_000
+"""Squares of all walls; in larger rooms they are larger."""
 NEAR = 0.06
-"""Distance (m) from the mesh up to which a tile is there already."""
+"""Distance (m) from the mesh up to which surface is there already."""
+ALONG = 0.9
+"""Cosine, with the normal of a plane, of the normals of surface by which its place is found."""
+DEVIATIONS = 3.0
+"""Distance from a plane, in standard deviations of that surface, up to which surface is of it; at least `NEAR`."""
+PARALLEL = 0.7
+"""Cosine of the normals of surface that is of a plane, noise included."""
 BEHIND = 0.02
-"""Least distance (m) by which tiles that overlap with the mesh lie behind it, so that no crack is left at its border."""
-RINGS = 2
-"""Tiles by which they overlap."""
+"""Distance (m) by which tiles of sides at the extent that overlap with the mesh lie behind it, so that no crack is left."""
+OVERLAP = 0.2
+"""How far (m) they overlap."""
 THROUGH = 0.05
 """Share by which a depth map must look beyond a tile to say that nothing is there."""
 BEYOND = 0.05
@@ -30,11 +39,12 @@ NOISE = 0.005
 
 
 class Walls(NamedTuple):
-    """Surface that closes a room.
+    """Flat surface that closes a room.
 
     Attributes:
         vertices: (n, 3); faces: (m, 3) int64, normals inward.
         side: (m,) int64, row of `sides` of each face.
+        found: (m,) bool, surface lay there that the face takes the place of.
         sides: the planes.
         error: (s,) root mean square distance (m) of the mesh from each side that prolongs a plane of it, NaN for others.
     """
@@ -42,6 +52,7 @@ class Walls(NamedTuple):
     vertices: NDArray
     faces: NDArray
     side: NDArray
+    found: NDArray
     sides: Enclosure
     error: NDArray
 
@@ -51,13 +62,14 @@ class Walls(NamedTuple):
         return self._replace(vertices=self.vertices @ turn.T, sides=sides)
 
 
-def missing_walls(
+def flat_walls(
     vertices: NDArray, faces: NDArray, depths: Sequence[NDArray], pictures: Sequence[Picture], points: NDArray | None = None
-) -> Walls:
-    """Return what a mesh lacks of the planes around it.
+) -> tuple[Walls, NDArray]:
+    """Return the planes around a room, and (m,) bool: the faces of its mesh whose place they take.
 
-    The planes are those of `enclosure`. A square of a plane is built where no surface is near, and no depth map shows anything
-    behind it, as through a door. What is built goes on a little behind the surface at its border.
+    The planes are those of `enclosure`. A square of a plane is built unless depth maps show something behind it, as through a
+    door. Where a plane prolongs surface of the mesh, it takes the place of the surface that lies on it. Planes at the extent
+    close what is left: there squares are built where no surface is near, and go on a little behind the surface at their border.
 
     Args:
         vertices, faces: (n, 3), metres, and (m, 3), with an area.
@@ -68,42 +80,94 @@ def missing_walls(
     centres = np.array([picture.centre for picture in pictures])
     sides = enclosure(vertices, faces, centres, "planes", margin=0.0, beyond=BEYOND, noise=NOISE, shown=points)
     normal, area = face_geometry(vertices, faces)
-    middle = vertices[faces].mean(1)
-    corners, tiles, of_side, error = [], [], [], np.full(len(sides.normal), np.nan)
-    for number, inward in enumerate(sides.normal):
-        outline = sides.vertices[np.unique(sides.faces[sides.side == number])]
-        offset = float(outline.mean(0) @ inward)
-        # A plane lies in the middle of the surface that it prolongs, not at its border.
-        if sides.from_plane[number]:
-            away = middle @ inward - offset
-            own = (np.abs(normal @ inward) > 0.9) & (np.abs(away) < BESIDE)
-            shift = float(np.average(away[own], weights=area[own])) if area[own].sum() > 0 else 0.0
-            error[number] = np.sqrt(np.average((away[own] - shift) ** 2, weights=area[own])) if area[own].sum() > 0 else np.nan
-            outline = outline + shift * inward
-        own_corners, own_tiles = _tiles(outline, inward)
-        tiles.append(own_tiles + sum(map(len, corners)))
-        corners.append(own_corners)
-        of_side.append(np.full(len(own_tiles), number))
-    grid, quads, side = np.concatenate(corners), np.concatenate(tiles), np.concatenate(of_side)
-    centre = grid[quads].mean(1)
-    away = _distance(vertices, faces, centre)
-    lacks = (away > NEAR) & ~_seen_through(centre, depths, pictures)
+    sides, error = _placed(sides, vertices[faces].mean(1), normal, area)
+    is_plane = np.isfinite(error)
+    corners, quads, side = _squares(sides)
 
-    # -------- tiles beside those that are lacking overlap with the mesh, behind it --------
-    kept = lacks.copy()
-    for _ in range(RINGS):
-        touched = np.zeros(len(grid), bool)
-        touched[quads[kept]] = True
-        kept |= (away <= NEAR) & touched[quads].any(1)
+    # -------- squares of planes, with nothing behind them, and the surface whose place they take --------
+    middle, of_plane = corners[quads].mean(1), is_plane[side]
+    kept = ~_seen_through(middle, depths, pictures)
+    found, thickness = np.zeros(len(quads), bool), np.maximum(NEAR, DEVIATIONS * error)
+    found[of_plane] = _distance(vertices, faces, middle[of_plane]) <= thickness[side[of_plane]]
+    own = kept & of_plane
+    flat = _lies_on(sides, thickness, corners, quads[own], side[own], vertices, faces)
+
+    # -------- squares at the extent, where surface is lacking; some beside them overlap with it, behind it --------
+    rest = faces[~flat]
+    near = ~of_plane
+    near[near] = _distance(vertices, rest, middle[near]) <= NEAR
+    kept &= ~near
+    edge = np.linalg.norm(corners[quads[0, 1]] - corners[quads[0, 0]])
+    for _ in range(max(1, round(OVERLAP / edge))):
+        touched = np.zeros(len(corners), bool)
+        touched[quads[kept & ~of_plane]] = True
+        kept |= near & touched[quads].any(1)
+    found = found[kept]
     quads, side = quads[kept], side[kept]
     used, first, local = np.unique(quads, return_index=True, return_inverse=True)
-    of_corner = side[first // 4]
-    placed = grid[used]
-    back = np.where(np.isnan(error), BEHIND, np.maximum(2 * np.nan_to_num(error), BEHIND))[of_corner]
-    placed = placed - (back * (_distance(vertices, faces, placed) <= NEAR))[:, None] * sides.normal[of_corner]
+    placed, of_corner = corners[used], side[first // 4]
+    hides = ~is_plane[of_corner]
+    hides[hides] = _distance(vertices, rest, placed[hides]) <= NEAR
+    placed = placed - (BEHIND * hides)[:, None] * sides.normal[of_corner]
     local = local.reshape(-1, 4)
     both = np.concatenate([local[:, [0, 1, 2]], local[:, [0, 2, 3]]])
-    return Walls(placed, both, np.concatenate([side, side]), sides, error)
+    return Walls(placed, both, np.tile(side, 2), np.tile(found, 2), sides, error), flat
+
+
+def _placed(sides: Enclosure, middle: NDArray, normal: NDArray, area: NDArray) -> tuple[Enclosure, NDArray]:
+    """Return the sides, those that prolong a plane in the middle of its surface and not at its border, and the root mean square
+    distance (s,) of that surface, NaN for sides at the extent."""
+    place, error = np.zeros((2, len(sides.normal)))
+    for number, inward in enumerate(sides.normal):
+        place[number] = (sides.vertices[np.unique(sides.faces[sides.side == number])] @ inward).mean()
+        away = middle @ inward - place[number]
+        own = (np.abs(normal @ inward) > ALONG) & (np.abs(away) < BESIDE) & sides.from_plane[number]
+        error[number] = np.nan
+        if area[own].sum() > 0:
+            shift = float(np.average(away[own], weights=area[own]))
+            place[number] += shift
+            error[number] = np.sqrt(np.average((away[own] - shift) ** 2, weights=area[own]))
+    sides, left = moved(sides, place)
+    return sides, error[left]
+
+
+def _squares(sides: Enclosure) -> tuple[NDArray, NDArray, NDArray]:
+    """Return corners (n, 3), squares (m, 4) of them that fill all sides, and the side (m,) of each."""
+    size = face_geometry(sides.vertices, sides.faces)[1].sum()
+    edge = max(TILE, float(np.sqrt(size / MOST_TILES)))
+    corners, quads, side, count = [], [], [], 0
+    for number, inward in enumerate(sides.normal):
+        own_corners, own_quads = _tiles(sides.vertices[np.unique(sides.faces[sides.side == number])], inward, edge)
+        corners.append(own_corners)
+        quads.append(own_quads + count)
+        side.append(np.full(len(own_quads), number))
+        count += len(own_corners)
+    return np.concatenate(corners), np.concatenate(quads), np.concatenate(side)
+
+
+def _lies_on(
+    sides: Enclosure, thickness: NDArray, corners: NDArray, quads: NDArray, side: NDArray, vertices: NDArray, faces: NDArray
+) -> NDArray:
+    """Return (m,) bool: the faces of a mesh whose place the squares of some side take.
+
+    All of such a face is within `thickness` (s,), NaN = never, of a square, and it is about parallel; or it is as near to squares
+    of two sides, where surface is round that should have an edge.
+    """
+    normal, middle = face_geometry(vertices, faces)[0], vertices[faces].mean(1)
+    parallel, count = np.zeros(len(faces), bool), np.zeros(len(faces), np.int64)
+    for number, inward in enumerate(sides.normal):
+        place = float(corners[quads[side == number][:1]].reshape(-1, 3).mean(0) @ inward) if (side == number).any() else np.nan
+        close = np.flatnonzero(np.abs(vertices @ inward - place)[faces].max(1) <= thickness[number])  # never, for NaN
+        if not len(close):
+            continue
+        own = quads[side == number]
+        foot = closest_points(corners, np.concatenate([own[:, [0, 1, 2]], own[:, [0, 2, 3]]]), middle[close]).points
+        off = middle[close] - foot
+        beside = np.linalg.norm(off - (off @ inward)[:, None] * inward, axis=1)
+        close = close[beside < 1e-6 + 0.5 * TILE]
+        count[close] += 1
+        parallel[close] |= np.abs(normal[close] @ inward) > PARALLEL
+    return parallel | (count > 1)
 
 
 def turn_to_walls(walls: Walls) -> NDArray:
@@ -122,13 +186,13 @@ def turn_to_walls(walls: Walls) -> NDArray:
 
 
 def _distance(vertices: NDArray, faces: NDArray, points: NDArray) -> NDArray:
-    if not len(points):
-        return np.zeros(0)
+    if not len(points) or not len(faces):
+        return np.full(len(points), np.inf)
     return np.linalg.norm(closest_points(vertices, faces, points).points - points, axis=1)
 
 
-def _tiles(outline: NDArray, inward: NDArray) -> tuple[NDArray, NDArray]:
-    """Corners (n, 3) and squares (m, 4) of about `TILE` that fill a convex outline (k, 3), seen from the side of `inward`."""
+def _tiles(outline: NDArray, inward: NDArray, edge: float) -> tuple[NDArray, NDArray]:
+    """Corners (n, 3) and squares (m, 4) of about `edge` that fill a convex outline (k, 3), seen from the side of `inward`."""
     u = np.cross(inward, np.eye(3)[np.abs(inward).argmin()])
     u /= np.linalg.norm(u)
     # Along the longest edge of the outline.
@@ -141,23 +205,28 @@ def _tiles(outline: NDArray, inward: NDArray) -> tuple[NDArray, NDArray]:
     v = np.cross(inward, u)
     flat = np.column_stack([(outline - middle) @ u, (outline - middle) @ v])[order]
     low, high = flat.min(0), flat.max(0)
-    count = np.maximum(np.ceil((high - low) / TILE).astype(int), 1)
+    count = np.maximum(np.ceil((high - low) / edge).astype(int), 1)
     a, b = (np.linspace(low[i], high[i], count[i] + 1) for i in range(2))
     grid = np.stack(np.meshgrid(a, b, indexing="ij"), -1).reshape(-1, 2)
     i, j = (k.ravel() for k in np.meshgrid(np.arange(count[0]), np.arange(count[1]), indexing="ij"))
     first = i * (count[1] + 1) + j
     quads = np.stack([first, first + count[1] + 1, first + count[1] + 2, first + 1], 1)
-    inner = grid[quads].mean(1)
+    # Squares of which a corner or the middle is inside: across a slanted border they reach behind the next side.
     along = np.roll(flat, -1, 0) - flat
-    turn = along[None, :, 0] * (inner[:, None, 1] - flat[None, :, 1]) - along[None, :, 1] * (inner[:, None, 0] - flat[None, :, 0])
-    return middle + grid[:, :1] * u + grid[:, 1:] * v, quads[(turn >= -1e-9).all(1)]
+    inside = np.zeros(len(quads), bool)
+    for part in (*grid[quads].transpose(1, 0, 2), grid[quads].mean(1)):
+        off = part[:, None] - flat
+        inside |= (along[:, 0] * off[..., 1] - along[:, 1] * off[..., 0] >= -1e-9).all(1)
+    return middle + grid[:, :1] * u + grid[:, 1:] * v, quads[inside]
 
 
 def _seen_through(points: NDArray, depths: Sequence[NDArray], pictures: Sequence[Picture]) -> NDArray:
-    """(n,) bool: at least two depth maps show something well behind a point."""
-    count = np.zeros(len(points), np.int64)
+    """(n,) bool: at least two depth maps show something well behind a point, and more of them than show surface at it."""
+    through, met = np.zeros((2, len(points)), np.int64)
     for depth, picture in zip(depths, pictures, strict=True):
         row, column, z, inside = picture.pixels(points, depth.shape)
         with np.errstate(invalid="ignore"):
-            count += inside & (depth[row, column] > (1 + THROUGH) * z + NEAR)
-    return count >= 2
+            behind = depth[row, column] - z
+            through += inside & (behind > THROUGH * z + NEAR)
+            met += inside & (np.abs(behind) <= THROUGH * z + NEAR)
+    return (through >= 2) & (through > met)

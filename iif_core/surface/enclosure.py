@@ -95,7 +95,13 @@ def enclosure(
         bound = np.maximum(bound, [_outermost(np.asarray(shown, np.float64) @ n) for n in outward])
 
     both = np.concatenate([found[:, :3], outward]), np.concatenate([found[:, 3], bound]) + margin
-    return _polyhedron(*both, np.arange(len(both[0])) < len(found), within.mean(0))
+    return _polyhedron(*both, np.arange(len(both[0])) < len(found), within.mean(0))[0]
+
+
+def moved(sides: Enclosure, place: ArrayLike) -> tuple[Enclosure, NDArray]:
+    """Return the same surface with each side at n . x = `place` (s,), and the numbers of the sides that are left of it."""
+    place = np.asarray(place, np.float64)
+    return _polyhedron(-sides.normal, -place, sides.from_plane, sides.vertices.mean(0))
 
 
 def fitted_plane(
@@ -212,8 +218,9 @@ def _bounding(
     return None
 
 
-def _polyhedron(outward: NDArray, bound: NDArray, from_plane: NDArray, inside: NDArray) -> Enclosure:
-    """Put the half-spaces n . x <= bound together; `inside`: (3,) a point that lies in all of them."""
+def _polyhedron(outward: NDArray, bound: NDArray, from_plane: NDArray, inside: NDArray) -> tuple[Enclosure, NDArray]:
+    """Put the half-spaces n . x <= bound together; `inside`: (3,) a point that lies in all of them. Also returns which of them
+    bound the whole."""
     corners = HalfspaceIntersection(np.column_stack([outward, -bound]), inside).intersections
     size = np.ptp(corners, axis=0).max()
     corners = np.unique(np.round(corners / (1e-9 * size)).astype(np.int64), axis=0) * (1e-9 * size)
@@ -225,4 +232,4 @@ def _polyhedron(outward: NDArray, bound: NDArray, from_plane: NDArray, inside: N
     turned = np.einsum("ij,ij->i", face_crosses(corners, faces), normal) > 0
     faces[turned] = faces[turned][:, ::-1]
     used, side = np.unique((normal @ outward.T).argmax(1), return_inverse=True)
-    return Enclosure(corners, faces.astype(np.int64), side.ravel(), -outward[used], from_plane[used])
+    return Enclosure(corners, faces.astype(np.int64), side.ravel(), -outward[used], from_plane[used]), used

@@ -28,6 +28,9 @@ BESIDE = 20
 INLIERS = 50, 0.4
 """Points that must agree on the place of a photograph, and their share (COLMAP: 30 and 0.25): fewer agree on wrong places where
 bricks and tiles repeat."""
+REPROJECTED = 1.5
+"""Pixels of the copies between a feature and its point, beyond which the two are not of each other (COLMAP: 4): matches that
+are a little wrong, as along bricks, bend a ring of cameras."""
 LEAST, LEAST_SHARE = 3, 0.5
 """Photographs that must hang together, and share of all."""
 _SEED = 0
@@ -118,6 +121,8 @@ def find_cameras(root: Path, names: Sequence[str], colour: str, progress: Progre
         options.num_threads = 1
         options.random_seed = _SEED
         options.mapper.abs_pose_min_num_inliers, options.mapper.abs_pose_min_inlier_ratio = INLIERS
+        options.mapper.filter_max_reproj_error = REPROJECTED
+        options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = REPROJECTED
         (Path(folder) / "sparse").mkdir()
         found = pycolmap.incremental_mapping(database, work, Path(folder) / "sparse", options)
     most = max(found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()), default=None)

@@ -39,17 +39,20 @@ def overview_png(
     above, below = figure.subfigures(2, 1, height_ratios=(3, 2))
     centre, ahead = sparse.world_from_camera[:, :3, 3], sparse.world_from_camera[:, :3, 2]
     dots = vertices[:: max(1, len(vertices) // _DOTS)]
-    upright = np.abs(walls.sides.normal[walls.side, 2]) < 0.5
-    middle = walls.vertices[walls.faces].mean(1)
-    level = np.abs(walls.sides.normal[walls.side, 2]) >= 0.5
-    of_view = {"from above": middle[upright], "from the side": middle[level | (np.abs(walls.sides.normal[walls.side, 1]) < 0.5)]}
-    for axes, (i, j), title in zip(above.subplots(1, 2), ((0, 1), (0, 2)), of_view, strict=True):
-        added = of_view[title]
-        axes.plot(added[:, i], added[:, j], ".", ms=1.5, color="tab:orange", alpha=0.4, label="added wall")
+    middle, normal = walls.vertices[walls.faces].mean(1), walls.sides.normal[walls.side]
+    level, across = np.abs(normal[:, 2]) >= 0.5, np.abs(normal[:, 1]) < 0.5
+    for axes, (i, j), title, cut in zip(
+        above.subplots(1, 2), ((0, 1), (0, 2)), ("from above", "from the side"), (~level, level | across), strict=True
+    ):
+        for own, colour, label in (
+            (walls.found, "tab:green", "flat side, in the place of surface"),
+            (~walls.found, "tab:orange", "flat side where nothing was found"),
+        ):
+            axes.plot(middle[cut & own, i], middle[cut & own, j], ".", ms=1.5, color=colour, alpha=0.4, label=label)
         axes.plot(dots[:, i], dots[:, j], ",", color="0.4", label="surface that photographs show")
         axes.quiver(centre[:, i], centre[:, j], ahead[:, i], ahead[:, j], color="tab:blue", width=0.003, label="camera")
         axes.set(aspect="equal", xlabel=f"{'xyz'[i]} (m)", ylabel=f"{'xyz'[j]} (m)", title=title)
-    above.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    above.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     shown = np.unique(np.linspace(0, len(pictures) - 1, SHOWN).round().astype(int))
     rows = below.subplots(2, len(shown), squeeze=False)
     far = float(np.nanquantile(np.concatenate([z[::4, ::4].ravel() for z in depths]), 0.98))

@@ -11,10 +11,10 @@ import trimesh
 from iif_core.errors import InputError
 from iif_core.numerics.parallel import map_in_order
 from iif_core.reconstruction.frame import RoomFrame, room_frame
-from iif_core.reconstruction.fusing import fused_mesh
+from iif_core.reconstruction.fusing import fused_mesh, large_pieces
 from iif_core.reconstruction.neighbours import neighbours
 from iif_core.reconstruction.sweep import Picture, agreed, swept_depth
-from iif_core.reconstruction.walls import Walls, missing_walls, turn_to_walls
+from iif_core.reconstruction.walls import Walls, flat_walls, turn_to_walls
 from iif_core.surface.triangles import face_geometry
 from workflow.reconstruction.cameras import Sparse, find_cameras, picture_of
 from workflow.reconstruction.files import overview_png, transforms_json
@@ -74,7 +74,8 @@ def run(job: Job) -> None:
         vertices = (vertices @ frame.turn.T + shift) * scale
         pictures = [p._replace(camera_from_world=c) for p, c in zip(pictures, sparse.camera_from_world, strict=True)]
         depths = [z * np.float32(scale) for z in depths]
-        walls = missing_walls(vertices, faces, depths, pictures, sparse.points)
+        walls, flat = flat_walls(vertices, faces, depths, pictures, sparse.points)
+        vertices, faces = large_pieces(vertices, faces, ~flat)
         # Along the axes of the world, as fitted walls tell it better than the normals by which the frame was found.
         turn = turn_to_walls(walls)
         sparse, vertices, walls = sparse.placed(turn, np.zeros(3), 1.0), vertices @ turn.T, walls.turned(turn)
@@ -152,22 +153,25 @@ def _metres(source: Any, frame: RoomFrame, sparse: Sparse) -> tuple[float, str]:
 def _facts(
     sparse: Sparse, frame: RoomFrame, scale: float, basis: str, walls: Walls, faces: int, voxel: float, shares: list[float]
 ) -> dict[str, Any]:
-    area = np.bincount(walls.side, face_geometry(walls.vertices, walls.faces)[1], len(walls.error))
+    area, count = face_geometry(walls.vertices, walls.faces)[1], len(walls.error)
+    found, built = (np.bincount(walls.side[own], area[own], count) for own in (walls.found, ~walls.found))
     planes = [
         {
             "normal": walls.sides.normal[i].round(4).tolist(),
             "from_plane": bool(walls.sides.from_plane[i]),
             "error_m": None if np.isnan(walls.error[i]) else round(float(walls.error[i]), 4),
-            "added_m2": round(float(area[i]), 2),
+            "found_m2": round(float(found[i]), 2),
+            "added_m2": round(float(built[i]), 2),
         }
-        for i in range(len(walls.error))
+        for i in range(count)
     ]
     known = walls.error[np.isfinite(walls.error)]
     notes = [
         f"cameras and mesh were found from the photographs: {len(sparse.names)} have a camera, {faces} faces, voxels of"
         f" {1000 * voxel:.3g} mm; depth that several confirm on {np.mean(shares):.0%} of the pixels",
-        f"flat walls were added where photographs show no texture: {area.sum():.3g} m2 on {len(planes)} sides"
-        + (f", of which {len(known)} prolong surface to within {1000 * known.max():.2g} mm" if len(known) else ""),
+        f"{count} flat sides, floor and ceiling included, take the place of {found.sum():.3g} m2 of surface"
+        + (f" that lies within {1000 * known.max():.2g} mm of them (standard deviation)" if len(known) else "")
+        + f", and close {built.sum():.3g} m2 where photographs show no texture",
         {
             "room_height": f"scale: the room is {(frame.ceiling - frame.floor) * scale:.3g} m high (source.room_height)",
             "camera_height": "scale: guessed, from cameras that are held at source.camera_height above the "
