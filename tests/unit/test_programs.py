@@ -1,13 +1,15 @@
 """One room in the layouts of several programs: each capture is that of the room, to the pixel."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from iif_core.camera.distortion import Distortion
+from iif_core.camera.distortion import Distortion, Pinhole
 from iif_core.errors import InputError
 from tests.errors import refused
 from tests.unit import own_scene as own
@@ -39,13 +41,14 @@ def save_obj(path, vertices, faces):
     path.write_text("\n".join(lines))
 
 
-def agrees(root, shots, world, lens=None):
+def agrees(root, shots, world, camera=own.CAMERA):
     """The capture has the poses `world` @ pose, the photographs, and the depth of the mesh."""
     capture = own.run(root, "capture")
     assert len(list(capture)) == len(shots)
     for view, (pose, picture, depth) in zip(capture, shots, strict=True):
         np.testing.assert_allclose(view.world_from_camera, world @ pose, atol=1e-6)
-        assert (view.fx, view.fy, view.cx, view.cy) == pytest.approx((60, 62, 33, 23), abs=1e-9)
+        expected = (camera.fx, camera.fy, camera.cx, camera.cy)
+        assert (view.fx, view.fy, view.cx, view.cy) == pytest.approx(expected, abs=1e-6)
         np.testing.assert_allclose(capture.gbuffer(view)[0], depth, rtol=1e-4)
         np.testing.assert_allclose(capture.photo(view)[0], picture, atol=0.003)
     return capture
@@ -147,11 +150,8 @@ def test_a_number_that_is_missing_is_named(tmp_path, shots):
 # -------------------------------------------------------------------------------------------------------------- Record3D
 
 
-@pytest.mark.parametrize("per_frame", [True, False])
-@pytest.mark.parametrize("name, below", [("metadata.json", "rgb"), ("metadata", "rgbd")])
-@pytest.mark.parametrize("factor", [1, 2])
-def test_record3d(tmp_path, shots, per_frame, name, below, factor):
-    path = own.project(tmp_path, source=PROJECT)
+def record3d(root, shots, per_frame=True, name="metadata.json", below="rgb", factor=1):
+    path = own.project(root, source=PROJECT)
     path.mkdir(parents=True)
     poses = []
     for i, (pose, picture, depth) in enumerate(shots):
@@ -166,6 +166,13 @@ def test_record3d(tmp_path, shots, per_frame, name, below, factor):
         document |= {"perFrameIntrinsicCoeffs": [lens.tolist()] * len(shots), "K": [0.0] * 9}
     (path / name).write_text(json.dumps(document))
     own.save_mesh(path / "mesh.ply", *vertices_in(TO_ARKIT))
+
+
+@pytest.mark.parametrize("per_frame", [True, False])
+@pytest.mark.parametrize("name, below", [("metadata.json", "rgb"), ("metadata", "rgbd")])
+@pytest.mark.parametrize("factor", [1, 2])
+def test_record3d(tmp_path, shots, per_frame, name, below, factor):
+    record3d(tmp_path, shots, per_frame, name, below, factor)
     capture = agrees(tmp_path, shots, TO_ARKIT)
     assert capture.facts["alignment"]["depth_median_disagreement"] < 0.01
 
@@ -189,8 +196,8 @@ def test_frames_of_record3d_that_have_no_photograph_are_left_out(tmp_path, shots
 # -------------------------------------------------------------------------------------------------------- 3D Scanner App
 
 
-def test_scanner_app(tmp_path, shots):
-    path = own.project(tmp_path, source=PROJECT)
+def scanner_app(root, shots):
+    path = own.project(root, source=PROJECT)
     path.mkdir(parents=True)
     k = np.array([[60.0, 0, 33], [0, 62, 23], [0, 0, 1]])
     for i, (pose, picture, depth) in enumerate(shots):
@@ -202,6 +209,10 @@ def test_scanner_app(tmp_path, shots):
         own.save_png(path / f"frame_{stem}.png", picture)
         own.save_depth(path / f"depth_{stem}.png", depth)
     save_obj(path / "export.obj", *vertices_in(TO_ARKIT))
+
+
+def test_scanner_app(tmp_path, shots):
+    scanner_app(tmp_path, shots)
     capture = agrees(tmp_path, shots, TO_ARKIT)
     assert capture.facts["alignment"]["depth_median_disagreement"] < 0.01
 
@@ -304,11 +315,12 @@ def test_xml_that_is_none(tmp_path, shots):
 # -------------------------------------------------------------------------------------------------------------- Meshroom
 
 
-def meshroom(root, shots, middle=True, since_2023=False, kind="radial3", name="cameras.sfm"):
+def meshroom(root, shots, middle=True, since_2023=False, kind="radial3", name="cameras.sfm", scale=1.0):
     path = own.project(root, source=PROJECT)
     for i, (_, picture, _) in enumerate(shots):
         own.save_png(path / f"images/{i:03d}.png", picture)
-    own.save_mesh(path / "mesh.ply", *own.room_mesh()[:2])
+    vertices, faces, _ = own.room_mesh()
+    own.save_mesh(path / "mesh.ply", scale * vertices, faces)
     point = [1.0, -1.0] if middle else [33.0, 23.0]
     lens = {
         "intrinsicId": "5",
@@ -412,3 +424,140 @@ def test_the_mesh_of_the_app_is_named_where_there_is_none(tmp_path, shots):
     path, _ = polycam(tmp_path, shots)
     (path / "raw.glb").unlink()
     assert "raw.glb" in message(own.run, tmp_path, "capture")
+
+
+# -------------------------------------------------------------------------------------------------- the page of each program
+
+PAGE = Path(__file__).parents[2] / "docs/guide/programs.md"
+UNIT = 0.42  # metres in a unit of a reconstruction without a metre, as the page has it
+HERE = np.eye(4)
+CENTRED = Pinhole(60.0, 60.0, 32.0, 24.0, 64, 48)
+
+
+def in_units(pose, scale=1 / UNIT):
+    moved = pose.copy()
+    moved[:3, 3] *= scale
+    return moved
+
+
+def photographs(path, shots):
+    for i, (_, picture, _) in enumerate(shots):
+        own.save_png(path / f"images/{i:03d}.png", picture)
+
+
+def colmap(path, shots, mesh, scale):
+    """A sparse model as text, in units of 1 / scale metres."""
+    photographs(path, shots)
+    (path / "sparse/0").mkdir(parents=True)
+    (path / "sparse/0/cameras.txt").write_text("# cameras\n1 PINHOLE 64 48 60 62 33 23\n")
+    (path / "sparse/0/points3D.txt").write_text("# points\n")
+    lines = ["# images"]
+    for i, (pose, _, _) in enumerate(shots):
+        to_camera = np.linalg.inv(in_units(pose, scale))
+        quaternion = Rotation.from_matrix(to_camera[:3, :3]).as_quat(scalar_first=True)
+        lines += [" ".join(map(repr, [i + 1, *quaternion.tolist(), *to_camera[:3, 3].tolist(), 1])) + f" {i:03d}.png", ""]
+    (path / "sparse/0/images.txt").write_text("\n".join(lines) + "\n")
+    vertices, faces, _ = own.room_mesh()
+    own.save_mesh(path / mesh, vertices * scale, faces)
+
+
+def transforms(path, shots, axes=OPENGL, world=HERE, scale=1.0, **more):
+    photographs(path, shots)
+    frames = [
+        {"file_path": f"images/{i:03d}.png", "transform_matrix": (world @ in_units(pose, scale) @ axes).tolist()}
+        for i, (pose, _, _) in enumerate(shots)
+    ]
+    vertices, faces, _ = own.room_mesh()
+    own.save_mesh(path / "mesh.ply", vertices * scale, faces)
+    document = own.intrinsics() | {"frames": frames} | more
+    own.write_transforms(path, document)
+    return document
+
+
+def nerfstudio(root, shots):
+    applied = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    transforms(root / "data/own", shots, world=applied, scale=1 / UNIT, applied_transform=applied[:3].tolist())
+
+
+def rgbd(root, shots):
+    document = transforms(root / "data/own", shots, axes=HERE)
+    for i, (_, _, depth) in enumerate(shots):
+        own.save_depth(root / f"data/own/depth/{i:03d}.png", depth)
+        document["frames"][i]["depth_file_path"] = f"depth/{i:03d}.png"
+    own.write_transforms(root / "data/own", document)
+
+
+def blender(root, shots):
+    """What the script on the page writes; `camera.matrix_world` has OpenGL axes."""
+    path, frames = root / "data/own", []
+    for i, (pose, picture, _) in enumerate(shots):
+        own.save_exr(path / f"images/Camera.{i:03d}.exr", {c: picture[..., k].astype(np.float32) for k, c in enumerate("RGB")})
+        angle = 2 * np.arctan(0.5 * 64 / CENTRED.fx)
+        matrix = (pose @ OPENGL).tolist()
+        frames.append({"file_path": f"images/Camera.{i:03d}.exr", "camera_angle_x": angle, "transform_matrix": matrix})
+    own.save_mesh(path / "mesh.ply", *own.room_mesh()[:2])
+    own.write_transforms(path, {"w": 64, "h": 48, "frames": frames})
+
+
+def metashape_with_a_place(root, shots):
+    metashape(root, shots, place=PLACE)
+
+
+def meshroom_in_units(root, shots):
+    meshroom(root, [(in_units(pose), picture, depth) for pose, picture, depth in shots], scale=1 / UNIT)
+
+
+def instant_ngp(root, shots):
+    transforms(root / "data/own", shots, scale=1 / UNIT, aabb_scale=16)
+
+
+def colmap_in_units(root, shots):
+    colmap(root / "data/own", shots, "dense/0/meshed-poisson.ply", 1 / UNIT)
+
+
+def realityscan(root, shots):
+    colmap(root / "data/own", shots, "model.ply", 1.0)
+
+
+PROGRAMS = {
+    "Polycam": lambda root, shots: polycam(root, shots, aligned=False),
+    "Record3D": record3d,
+    "3D Scanner App": scanner_app,
+    "COLMAP": colmap_in_units,
+    "RealityScan": realityscan,
+    "Metashape": metashape_with_a_place,
+    "Meshroom": meshroom_in_units,
+    "nerfstudio": nerfstudio,
+    "instant-ngp": instant_ngp,
+    "Blender": blender,
+    "RGB-D data sets": rgbd,
+}
+"""Writers of the layouts; the apps have worlds of their own."""
+APPS = {"Polycam", "Record3D", "3D Scanner App"}
+
+
+def pages():
+    """Section of the page -> its YAML."""
+    sections = re.split(r"^## (.+)$", PAGE.read_text(), flags=re.MULTILINE)[1:]
+    blocks = {
+        name: re.findall(r"```yaml\n(.*?)```", text, re.DOTALL) for name, text in zip(sections[::2], sections[1::2], strict=True)
+    }
+    return {name: found[0] for name, found in blocks.items() if found}
+
+
+def test_every_program_of_the_page_is_tried():
+    assert set(pages()) == {"Photographs alone", *PROGRAMS}  # the former by test_photographs_alone.py
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_the_page_of_a_program_is_enough(tmp_path, shots, program):
+    """Its layout, and its YAML with the folder's name alone changed: poses, lens, photographs and depth are those of the room."""
+    camera = own.CAMERA
+    if program == "Blender":
+        geometry, camera = own.geometry(), CENTRED
+        shots = [(pose, *own.shoot(geometry, pose, camera)[:2]) for pose in own.poses(COUNT)]
+    own.project(tmp_path)
+    PROGRAMS[program](tmp_path, shots)
+    text = pages()[program].replace("data/livingroom", "data/own")
+    (tmp_path / "config/scenes/own.yaml").write_text(text)
+    agrees(tmp_path, shots, TO_ARKIT if program in APPS else HERE, camera)
