@@ -238,6 +238,23 @@ def test_what_could_take_the_place_of_a_suspect_is_always_traced():
     assert found == {7} and len(changes) == 1 and frozenset({5}) not in traced
 
 
+def test_all_that_is_unlikely_is_always_traced_as_gone():
+    """The patch and dark unseen surface; the lamp is likely, or the patch shines for certain, or one alone is unlikely."""
+    room = replace(_room(1.0), certain=11.0)
+
+    def always(unlikely, chosen=(0, 1, 3), room=room):
+        found = room.proposals(frozenset(chosen), unlikely=frozenset(unlikely))
+        return {p.families: p.largest_growth for p in found if p.always}
+
+    assert always({1, 3}) == {frozenset({0}): 1.0}
+    assert always({1, 2, 3}) == always({1, 3})  # what does not shine counts for nothing
+    assert not always({1}) and not always(())
+    assert not always({1, 3}, room=replace(room, certain=2.0))
+    assert not always({0, 1, 3})  # something in a closed room shines
+    outside = replace(room, family=np.array([-1, 0, 1, 2]))
+    assert always({0, 2}, (0, 2), outside) == {frozenset(): 1.0}
+
+
 def test_unseen_surface_that_a_white_one_could_match_is_no_lamp():
     assert not any(2 in families for families in _growth(_room(1.0, reflects=1e3), 0, 1))
 

@@ -37,7 +37,7 @@ from iif_core.light.emission.problem import (
 )
 from iif_core.light.emission.pruning import PrunedEmission, WhiteSurface, insignificant, prune_groups
 from iif_core.light.emission.rows import TracedTransport, light_of
-from iif_core.light.emission.search import HIDDEN_EXCESS, QUICK, Candidates, Families, search
+from iif_core.light.emission.search import HIDDEN_EXCESS, QUICK, Candidates, Families, Proposal, search
 from iif_core.light.tracer import Tracer
 from iif_core.surface.cells import pack_keys, voxel_indices
 
@@ -221,7 +221,19 @@ def search_emitters(
     suspects = sorted((f for f, value in brightest.items() if value < certain), key=lambda f: -given[f])[:SUSPECTS]
     # Without light from outside something in the room has to shine.
     doubtful = frozenset(f for f, value in brightest.items() if sky is not None and value < HIDDEN_EXCESS and weights[f] >= 1.0)
-    chosen, changes = search(start, lambda present: look.proposals(present, doubtful, frozenset(suspects)), misfit, look.weight)
+    evidence = LampEvidence(
+        is_likely=np.append(odds.is_likely, False)[owner],
+        is_saturated=np.array([look.is_saturated(f) for f in family.tolist()], bool),
+        is_hidden=every.is_hidden,
+        needed=np.zeros(every.size),
+    )
+    # Without a largest value of the photographs nothing tells what is likely.
+    unlikely = frozenset() if photos.sensor.is_hdr else frozenset(family[evidence.is_unlikely].tolist())
+
+    def proposals(present: Families) -> list[Proposal]:
+        return look.proposals(present, doubtful, frozenset(suspects), unlikely)
+
+    chosen, changes = search(start, proposals, misfit, look.weight)
     told, before = [], start
     for after, old, new in changes:
         parts = [(after - before, "added"), (before - after, "taken out")]
@@ -231,13 +243,8 @@ def search_emitters(
         before = after
     is_chosen, shines = np.isin(family, [*chosen]), np.zeros(all_groups, bool)
     shines[offered] = is_chosen[: groups.size]
-    own, needed = family[is_chosen].tolist(), look.needed(chosen)
-    evidence = LampEvidence(
-        is_likely=np.append(odds.is_likely, False)[owner[is_chosen]],
-        is_saturated=np.array([look.is_saturated(f) for f in own], bool),
-        is_hidden=every.is_hidden[is_chosen],
-        needed=np.array([needed[f] for f in own], np.float64),
-    )
+    needed = look.needed(chosen)
+    evidence = replace(evidence.select(is_chosen), needed=np.array([needed[f] for f in family[is_chosen].tolist()], np.float64))
     return traced(photos, unseen, every.select(is_chosen), sky, threshold), shines, told, evidence
 
 

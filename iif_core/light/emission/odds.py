@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -184,3 +184,8 @@ class LampEvidence:
         """(G,) that it is a lamp, as often as in rooms with truth (docs/method/light.md#probability-of-a-lamp)."""
         constant, *counts = PROBABILITY
         return 1.0 / (1.0 + np.exp(-(constant + self.columns @ np.array(counts))))
+
+    @property
+    def is_unlikely(self) -> np.ndarray:
+        """(G,) bool: by its looks alone, without what it is needed for, it is more probably no lamp."""
+        return replace(self, needed=np.zeros(len(self.needed))).probability < 0.5

@@ -85,14 +85,21 @@ class Candidates:
         """Return the factor on the misfit of the families."""
         return float(np.prod(self.weights[sorted(families)])) if families else 1.0
 
-    def proposals(self, chosen: Families, doubtful: Families = frozenset(), suspects: Families = frozenset()) -> list[Proposal]:
+    def proposals(
+        self,
+        chosen: Families,
+        doubtful: Families = frozenset(),
+        suspects: Families = frozenset(),
+        unlikely: Families = frozenset(),
+    ) -> list[Proposal]:
         """Return sets of families that may explain the photographs better than `chosen`, the most promising first.
 
         Families are taken out, added, or put in the place of one of the chosen; added ones in the order of what their light alone
         would take off the misfit. Families that are `doubtful` are taken out if the misfit does not grow, and those that are no
         brighter than a white surface in their place unless it grows by half. Families that are `certain` times as bright as one
         stay. `suspects` may only seem to shine because the light of others was given to them; the first look is wrong while they
-        do, so what could take their place is always traced, however bright they are.
+        do, so what could take their place is always traced, however bright they are. So is the set without all that are
+        `unlikely`, if several are: each of several false lamps makes the others look needed.
         """
         misfit, lit, _ = self._look(chosen)
         found: dict[Families, float] = {}
@@ -126,6 +133,14 @@ class Candidates:
             largest[rest] = look, _MISSED if reflects else 1.0 if out in doubtful else 1.0 - STEP
             if (rest or (self.family < 0).any()) and self._must_shine(out, white):
                 impossible.add(rest)
+        likely = chosen - unlikely
+        if len(chosen - likely) > 1 and (likely or (self.family < 0).any()):
+            found[likely], _, white = self._look(likely)
+            likely |= {f for f in chosen - likely if self._must_shine(f, white)}
+            if len(chosen - likely) > 1:
+                found[likely] = self._look(likely)[0]
+                largest[likely] = np.inf, 1.0
+                always.add(likely)
         order = sorted(
             found.keys() - impossible, key=lambda f: (found[f] * self.weight(f) * (1.0 + PROMISING) ** len(f), sorted(f))
         )
