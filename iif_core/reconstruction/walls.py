@@ -30,6 +30,8 @@ BEHIND = 0.02
 """Distance (m) by which tiles of sides at the extent that overlap with the mesh lie behind it, so that no crack is left."""
 OVERLAP = 0.2
 """How far (m) they overlap."""
+CLOSES = 0.5
+"""Share of the sides that must be planes for those at the extent to be built: they close a room, and do not make one up."""
 THROUGH = 0.05
 """Share by which a depth map must look beyond a tile to say that nothing is there."""
 BEYOND = 0.05
@@ -69,7 +71,8 @@ def flat_walls(
 
     The planes are those of `enclosure`. A square of a plane is built unless depth maps show something behind it, as through a
     door. Where a plane prolongs surface of the mesh, it takes the place of the surface that lies on it. Planes at the extent
-    close what is left: there squares are built where no surface is near, and go on a little behind the surface at their border.
+    close what is left, if at least half of the sides are planes: there squares are built where no surface is near, and go on a
+    little behind the surface at their border.
 
     Args:
         vertices, faces: (n, 3), metres, and (m, 3), with an area.
@@ -96,6 +99,7 @@ def flat_walls(
     rest = faces[~flat]
     near = ~of_plane
     near[near] = _distance(vertices, rest, middle[near]) <= NEAR
+    kept &= of_plane | (is_plane.mean() >= CLOSES)
     kept &= ~near
     edge = np.linalg.norm(corners[quads[0, 1]] - corners[quads[0, 0]])
     for _ in range(max(1, round(OVERLAP / edge))):

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from iif_core.errors import InputError
 from iif_core.surface.triangles import face_geometry
-from iif_core.surface.xatlas_process import pack
+from iif_core.surface.xatlas_process import Packed, pack
 
 PADDING = 4
 """Texels between two charts: two levels of mip maps do not mix them; beyond, every texel has the value of the nearest chart."""
@@ -26,6 +26,10 @@ UNSEEN = 64
 """Texels along the side of a square for a mesh that no photograph shows, at most; its material is the mean of its object."""
 SEEN_SHARE = 4.0
 """Texels of a mesh over those of what photographs show of it, at most: a lawn of which a window shows a strip stays small."""
+LEAST_SCALE = 0.25
+"""Part of the density that fits by area below which a larger atlas is better: many small charts fill it with what is between."""
+MOST_TIMES = 4
+"""Times that an atlas may be larger along a side than was asked for."""
 _ROUNDS = 12
 _UNIT = 1e-3
 """Texels per unit of length in xatlas, which ignores faces with an area below 1e-7 squared units."""
@@ -77,28 +81,23 @@ def unwrap(meshes: Sequence[tuple[NDArray, NDArray]], density: ArrayLike, larges
     Args:
         meshes: vertices (n, 3) metres and faces (m, 3), m >= 1, of each.
         density: texels a metre wanted for each mesh, > 0. All are lowered by one factor where they do not fit.
-        largest: side of the atlas in texels, at most.
+        largest: side of the atlas in texels, at most; twice or four times that where the charts do not fit at any density,
+            because there are so many, each with texels around it.
 
     Raises:
-        InputError: the charts do not fit at any density, because there are too many.
+        InputError: there are still too many.
     """
     density = np.asarray(density, np.float64)
-    # First guess: charts fill the share FULL of the largest atlas. Each round that does not fit lowers all densities.
     texels = sum(d * d * face_geometry(*mesh)[1].sum() for mesh, d in zip(meshes, density, strict=True))
-    scale = min(1.0, float(largest * np.sqrt(FULL / max(texels, 1e-12))))
-    for _ in range(_ROUNDS):
-        scaled = []
-        for (vertices, faces), own in zip(meshes, density, strict=True):
-            middle = vertices.mean(0)  # small numbers lose less in single precision
-            scaled.append((((vertices - middle) * (own * scale / _UNIT)).astype(np.float32), faces.astype(np.uint32)))
-        packed = pack(scaled, PADDING, _UNIT)
-        width, height = packed.width, packed.height
-        if 0 < max(width, height) <= largest and packed.atlases == 1:
-            break
-        scale *= min(0.97, 0.99 * largest / max(width, height, 1))
-    else:
-        raise InputError(f"texture atlas: {packed.charts} charts do not fit into {largest} x {largest} texels; raise it")
-    size = min(STEP * -(-max(width, height) // STEP), largest)
+    limit = largest
+    while (fitted := _fitted(meshes, density, limit, texels)) is None:
+        limit *= 2
+        if limit > MOST_TIMES * largest:
+            limit //= 2
+            raise InputError(f"texture atlas: the charts do not fit into {limit} x {limit} texels, because there are too many")
+    packed, scale = fitted
+    width, height = packed.width, packed.height
+    size = min(STEP * -(-max(width, height) // STEP), limit)
     source, uv, new = [], [], []
     for (vertices, _), (rows, faces, coordinates, chart) in zip(meshes, packed.meshes, strict=True):
         source.append(rows.astype(np.int64))
@@ -107,6 +106,25 @@ def unwrap(meshes: Sequence[tuple[NDArray, NDArray]], density: ArrayLike, larges
         # Coordinates of xatlas run over its own width and height; the picture is a square of whole steps.
         uv.append((coordinates * np.array([width / size, height / size])).astype(np.float32))
     return Unwrapped(source, uv, new, size, scale, packed.charts)
+
+
+def _fitted(meshes: Sequence[tuple[NDArray, NDArray]], density: NDArray, limit: int, texels: float) -> tuple[Packed, float] | None:
+    """Return charts in one atlas of at most `limit` texels along a side, and the factor <= 1 on the densities that made them fit;
+    None if none does. `texels`: of all meshes at the densities wanted."""
+    # First guess: charts fill the share FULL of the largest atlas. Each round that does not fit lowers all densities.
+    scale = first = min(1.0, float(limit * np.sqrt(FULL / max(texels, 1e-12))))
+    for _ in range(_ROUNDS):
+        if scale < LEAST_SCALE * first:
+            break
+        scaled = []
+        for (vertices, faces), own in zip(meshes, density, strict=True):
+            middle = vertices.mean(0)  # small numbers lose less in single precision
+            scaled.append((((vertices - middle) * (own * scale / _UNIT)).astype(np.float32), faces.astype(np.uint32)))
+        packed = pack(scaled, PADDING, _UNIT)
+        if 0 < max(packed.width, packed.height) <= limit and packed.atlases == 1:
+            return packed, scale
+        scale *= min(0.97, 0.99 * limit / max(packed.width, packed.height, 1))
+    return None
 
 
 def _nearest_with(has: NDArray, points: NDArray) -> NDArray:

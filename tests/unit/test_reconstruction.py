@@ -229,6 +229,15 @@ def test_walls_at_the_extent_close_a_room_behind_what_is_there():
     assert (np.abs(ends[(np.abs(ends[:, 1]) < 0.5), 0] - place) < 1e-6).all()
 
 
+def test_most_of_a_room_is_not_made_up():
+    """Of six sides two were found: the others stay open."""
+    vertices, faces = fine(*room(((0, 1), (0, -1), (1, 1), (2, 1))))
+    picture = Picture(np.zeros((4, 4), np.float32), INTRINSICS, looking((0.1, 0.2, 0.0), (1.0, 0.0, 0.0)))
+    built, flat = flat_walls(vertices, faces, [np.full((4, 4), np.nan, np.float32)], [picture])
+    assert flat.all() and np.isfinite(built.error).sum() == 2
+    assert np.isfinite(built.error[built.side]).all() and built.found.mean() > 0.95
+
+
 def test_squares_leave_no_crack_along_slanted_borders():
     from iif_core.reconstruction.walls import _tiles
 

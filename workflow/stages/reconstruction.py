@@ -14,7 +14,7 @@ from iif_core.reconstruction.frame import RoomFrame, room_frame
 from iif_core.reconstruction.fusing import fused_mesh, large_pieces
 from iif_core.reconstruction.neighbours import neighbours
 from iif_core.reconstruction.sweep import Picture, agreed, swept_depth
-from iif_core.reconstruction.walls import Walls, flat_walls, turn_to_walls
+from iif_core.reconstruction.walls import CLOSES, Walls, flat_walls, turn_to_walls
 from iif_core.surface.triangles import face_geometry
 from workflow.reconstruction.cameras import Sparse, find_cameras, picture_of
 from workflow.reconstruction.files import overview_png, transforms_json
@@ -169,9 +169,14 @@ def _facts(
     notes = [
         f"cameras and mesh were found from the photographs: {len(sparse.names)} have a camera, {faces} faces, voxels of"
         f" {1000 * voxel:.3g} mm; depth that several confirm on {np.mean(shares):.0%} of the pixels",
-        f"{count} flat sides, floor and ceiling included, take the place of {found.sum():.3g} m2 of surface"
+        f"flat sides, floor and ceiling included, take the place of {found.sum():.3g} m2 of surface"
         + (f" that lies within {1000 * known.max():.2g} mm of them (standard deviation)" if len(known) else "")
-        + f", and close {built.sum():.3g} m2 where photographs show no texture",
+        + f", and {built.sum():.3g} m2 are built where photographs show no texture",
+        *(
+            [f"WARNING {count - len(known)} sides stay open: {len(known)} of {count} are flat surface; show more of walls and ceiling"]
+            if len(known) < CLOSES * count
+            else []
+        ),
         {
             "room_height": f"scale: the room is {(frame.ceiling - frame.floor) * scale:.3g} m high (source.room_height)",
             "camera_height": "scale: guessed, from cameras that are held at source.camera_height above the "

@@ -45,6 +45,8 @@ def run(job: Job) -> None:
     density = _densities(parts, area, footprint, np.bincount(base.cell_object, minlength=n_objects), base.cell_edge)
     made = unwrap([(part.vertices, part.faces) for part in parts], density, wanted.texture_size)
     job.log.info("atlas of %d x %d texels, %d charts, densities times %.3f", made.size, made.size, made.charts, made.shrunk)
+    if made.size > wanted.texture_size:
+        job.log.warning("larger than `export.texture_size`, %d: the mesh has so many charts", wanted.texture_size)
     first = np.cumsum([0, *(len(rows) for rows in made.source)])
     xyz = np.concatenate([part.vertices[rows] for part, rows in zip(parts, made.source, strict=True)])
     normal = np.concatenate([part.normals[rows] for part, rows in zip(parts, made.source, strict=True)])
