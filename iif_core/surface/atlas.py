@@ -108,7 +108,9 @@ def unwrap(meshes: Sequence[tuple[NDArray, NDArray]], density: ArrayLike, larges
     return Unwrapped(source, uv, new, size, scale, packed.charts)
 
 
-def _fitted(meshes: Sequence[tuple[NDArray, NDArray]], density: NDArray, limit: int, texels: float) -> tuple[Packed, float] | None:
+def _fitted(
+    meshes: Sequence[tuple[NDArray, NDArray]], density: NDArray, limit: int, texels: float
+) -> tuple[Packed, float] | None:
     """Return charts in one atlas of at most `limit` texels along a side, and the factor <= 1 on the densities that made them fit;
     None if none does. `texels`: of all meshes at the densities wanted."""
     # First guess: charts fill the share FULL of the largest atlas. Each round that does not fit lowers all densities.

@@ -172,11 +172,6 @@ def _facts(
         f"flat sides, floor and ceiling included, take the place of {found.sum():.3g} m2 of surface"
         + (f" that lies within {1000 * known.max():.2g} mm of them (standard deviation)" if len(known) else "")
         + f", and {built.sum():.3g} m2 are built where photographs show no texture",
-        *(
-            [f"WARNING {count - len(known)} sides stay open: {len(known)} of {count} are flat surface; show more of walls and ceiling"]
-            if len(known) < CLOSES * count
-            else []
-        ),
         {
             "room_height": f"scale: the room is {(frame.ceiling - frame.floor) * scale:.3g} m high (source.room_height)",
             "camera_height": "scale: guessed, from cameras that are held at source.camera_height above the "
@@ -184,6 +179,11 @@ def _facts(
             + ("; source.room_height, from floor to ceiling, is better" if frame.has_floor and frame.has_ceiling else ""),
         }[basis],
     ]
+    if len(known) < CLOSES * count:
+        notes.append(
+            f"WARNING the room stays open: flat surface was found on {len(known)} of its {count} sides; show walls and ceiling"
+            " too, from several places"
+        )
     for why in dict.fromkeys(sparse.left_out.values()):
         names = [name for name, own in sparse.left_out.items() if own == why]
         notes.append(f"{len(names)} photographs are left out, such as {names[0]}: {why}")
