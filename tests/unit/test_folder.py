@@ -702,3 +702,15 @@ def test_red_kitchen_passes_the_door(tmp_path, test_scene):
     assert facts["edge_correlation"] > 0.2
     own.project(tmp_path, {"axes": "opencv"}, {"views": 4, "width": 160, "height": 160})
     assert proposed(fails(tmp_path))[0] == "axes: opengl"
+
+
+def test_the_ground_around_a_house_does_not_tell_its_size():
+    rng = np.random.default_rng(0)
+    house = rng.uniform(0, 5, (1000, 3))
+    ground = np.array([[-110.0, -110, 0], [110, -110, 0], [110, 110, 0], [-110, 110, 0]])
+    every = np.concatenate([house, ground])
+    mesh.check_across(Path("scene.xml"), every, "m", 1.0)
+    with refused("scene.xml", "cm"):
+        mesh.check_across(Path("scene.xml"), 100 * every, "m", 1.0)
+    with refused("scene.xml"):
+        mesh.check_across(Path("scene.xml"), 0.001 * house, "m", 1.0)

@@ -39,6 +39,7 @@ FARTHEST = 1000.0
 """Metres from the origin beyond which an origin of the scene's own is subtracted: single precision, in which rays are traced, is
 0.06 mm there, and half a metre where projected coordinates of a map are."""
 UPRIGHT = 0.8  # cosine with the vertical from which a side is a floor or a ceiling
+MARGIN = 0.01  # share of the vertices at each end that does not tell the size
 TYPICAL_DIAGONAL = 7.0  # metres; the unit that comes nearest to it is proposed
 
 
@@ -354,11 +355,12 @@ def check_across(path: Path, vertices: np.ndarray, unit: str | float, metres: fl
     """Refuse a scene whose size (m) cannot be that of a room; the message proposes the unit that would make it one.
 
     Raises:
-        InputError: its vertices (n, 3), in metres, reach less than 0.5 m or more than 200 m; other arguments as `check_size`.
+        InputError: its vertices (n, 3), in metres, reach less than 0.5 m or more than 200 m, and so do those without a hundredth
+            at each end, as the ground around a house has it; other arguments as `check_size`.
     """
     low, high = DIAGONAL
-    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    if low <= diagonal <= high:
+    diagonal, most = (float(np.linalg.norm(np.ptp(np.quantile(vertices, (q, 1 - q), axis=0), axis=0))) for q in (0.0, MARGIN))
+    if low <= diagonal <= high or low <= most <= high:
         return
     found = f"{path}: the scene is {diagonal:.4g} m across (allowed {low:g} to {high:g} m), read with `source.unit: {unit}`"
     cameras = 0.0 if centres is None else float(np.linalg.norm(np.ptp(centres, axis=0)))
@@ -367,7 +369,8 @@ def check_across(path: Path, vertices: np.ndarray, unit: str | float, metres: fl
             f"{found}, but the cameras span {cameras:.3g} m: mesh and poses are in different units; bring the mesh"
             " into the unit of transforms.json (is it in millimetres? then scale its vertices by 0.001)"
         )
-    across = {name: diagonal / metres * factor for name, factor in METRES.items()}
+    size = diagonal if 2 * most > diagonal else most
+    across = {name: size / metres * factor for name, factor in METRES.items()}
     name, size = min(across.items(), key=lambda item: abs(np.log(item[1] / TYPICAL_DIAGONAL)))
     if low <= size <= high:
         raise InputError(f"{found}; `source: {{unit: {name}}}` makes it {size:.3g} m")
