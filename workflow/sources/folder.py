@@ -408,9 +408,10 @@ def _better_depth(task: _Task, seen: list[tuple[Frame, View]]) -> str:
     if not pairs:
         return ""
     listed, tolerance = task.inputs.cameras, alignment.TOLERANCE
-    return alignment.explain(pairs, task.room.depth_along, task.conventions, listed.known, listed.depth_unit, tolerance)
+    given = listed.known, listed.depth_unit, tolerance, task.room.size
+    return alignment.explain(pairs, task.room.depth_along, task.conventions, *given)
 
 
 def _better_edges(task: _Task, trials: list[alignment.Trial], now: float) -> str:
     """Say which other convention fits the edges of the photographs clearly better than the one in use, which has `now`."""
-    return alignment.explain_edges(trials, task.room.along, task.conventions, task.inputs.cameras.known, now)
+    return alignment.explain_edges(trials, task.room.along, task.conventions, task.inputs.cameras.known, now, task.room.size)

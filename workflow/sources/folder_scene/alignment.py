@@ -4,7 +4,7 @@ few pixels.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from workflow.settings.source import MESH_UP
 from workflow.sources.folder_scene import images
 from workflow.sources.folder_scene.camera import METRES, opencv_pose
 from workflow.sources.folder_scene.frames import Frame
+from workflow.sources.folder_scene.mesh import LEAST_SPREAD
 
 TOLERANCE = 0.05  # largest accepted median relative difference of depth, where depth images or sparse points exist
 DEPTH_SAMPLES = 20_000  # depth pixels compared per view
@@ -191,6 +192,7 @@ def explain(
     known: bool,
     depth_unit: float | None,
     tolerance: float,
+    size: float,
 ) -> str:
     """Find a convention that fits the depth images (or sparse points) better.
 
@@ -201,6 +203,7 @@ def explain(
         known: whether the format of the file determines the axes.
         depth_unit: metres per value of the depth images; None = by their format.
         tolerance: largest acceptable disagreement.
+        size: of the mesh, metres.
 
     Returns:
         Advice as text; empty if no convention fits.
@@ -227,11 +230,12 @@ def explain(
         return np.concatenate(parts)
 
     as_is = ratios(conventions)
-    scores = [(disagreement(ratios(c)), text) for text, c in candidates(conventions, known)]
+    others = [(text, c) for text, c in candidates(conventions, known) if not _at_one_point([f for f, _ in chosen], c, size)]
+    scores = [(disagreement(ratios(c)), text) for text, c in others]
     if np.isfinite(as_is).any() and any(depth is not None for depth in depths):  # sparse points have no scale of their own
         factor = float(np.nanmedian(as_is))
         scores.append((disagreement(as_is / factor), _unit_advice(conventions.metres, factor)))
-    best, text = min(scores)
+    best, text = min(scores, default=(np.inf, ""))
     return f"{text} (disagreement {best:.1%})" if best <= min(tolerance, 0.5 * disagreement(as_is)) else ""
 
 
@@ -241,6 +245,7 @@ def explain_edges(
     conventions: Conventions,
     known: bool,
     now: float,
+    size: float,
 ) -> str:
     """Find a convention that aligns the mesh's edges with those of the photographs.
 
@@ -250,6 +255,7 @@ def explain_edges(
         conventions: those in use.
         known: whether the format of the file determines the axes.
         now: correlation with the convention in use.
+        size: of the mesh, metres.
 
     Returns:
         Advice as text; empty if no convention is clearly better.
@@ -264,8 +270,15 @@ def explain_edges(
             found.append(edge_correlation(*edges)[SHIFT, SHIFT] if (depth > 0).any() else 0.0)
         return float(np.mean(found)) if found else 0.0
 
-    best, text = max((correlation(c), text) for text, c in candidates(conventions, known))
+    others = [(text, c) for text, c in candidates(conventions, known) if not _at_one_point([t[0] for t in trials], c, size)]
+    best, text = max(((correlation(c), text) for text, c in others), default=(0.0, ""))
     return f"{text} (edges correlate {best:.2f}, as read {now:.2f})" if best >= max(CLEAR_CORRELATION, 3 * now) else ""
+
+
+def _at_one_point(frames: Sequence[Frame], tried: Conventions, size: float) -> bool:
+    """Several cameras stand together in a mesh of a size (m): what fits then fits by chance."""
+    positions = np.array([tried.pose(frame)[:3, 3] for frame in frames])
+    return len(frames) > 1 and float(np.linalg.norm(np.ptp(positions, axis=0))) < LEAST_SPREAD * size
 
 
 def _unit_advice(metres: float, factor: float) -> str:

@@ -18,10 +18,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Room:
-    """A mesh that rays can meet; normals (m, 3) float32 of its faces, 0 for degenerate ones."""
+    """A mesh that rays can meet; normals (m, 3) float32 of its faces, 0 for degenerate ones; its size, metres."""
 
     geometry: Geometry
     normals: np.ndarray
+    size: float
 
     @classmethod
     def of(cls, mesh: Mesh, threads: int) -> Room:
@@ -32,7 +33,7 @@ class Room:
         from iif_core.light.transport.geometry import build_geometry
 
         geometry = build_geometry(mesh.vertices, mesh.faces, np.full(len(mesh.faces), -1, np.int32))
-        return cls(geometry, face_geometry(mesh.vertices, mesh.faces)[0].astype(np.float32))
+        return cls(geometry, face_geometry(mesh.vertices, mesh.faces)[0].astype(np.float32), mesh.diagonal)
 
     def seen(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Return z-depth (H, W) float32 with 0 = miss, and face ids (H, W) with -1 = miss, of a view."""
