@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -562,6 +563,28 @@ def test_any_quarter_turn_of_the_mesh_is_named_and_undone(tmp_path):
     # A wrong turn: the right one is named, not the one from the wrong to the right.
     own.project(tmp_path, {"mesh_up": "y"})
     assert proposed(fails(tmp_path))[0] == "mesh_up: z x y"
+
+
+def test_a_convention_that_puts_all_cameras_at_one_point_is_not_proposed(monkeypatch):
+    """Whatever is tried seems to fit edges, and the smallest scale best."""
+    matrices = [pose @ np.diag([1.0, -1, -1, 1]) for pose in own.poses(4)]
+    frames = [SimpleNamespace(matrix=matrix) for matrix in matrices]
+    now, size = alignment.Conventions("opengl", 1.0), 5.0
+    nearness = []
+
+    def trace(origin, rays):
+        nearness.append(1.0 / (1.0 + np.linalg.norm(origin)))
+        return np.ones(rays.shape[:2]), np.tile([0.0, 0, 1], (*rays.shape[:2], 1))
+
+    def correlation(seen, mesh):
+        return np.full((9, 9), nearness[-1])
+
+    monkeypatch.setattr(alignment, "edge_correlation", correlation)
+    trials = [(frame, own.CAMERA, np.full((48, 64, 3), 0.5), np.ones((48, 64), bool)) for frame in frames]
+    said = alignment.explain_edges(trials, trace, now, True, 0.01, size)
+    assert said and "times" not in said
+    assert "times 0.001" in alignment.explain_edges(trials[:1], trace, now, True, 0.01, size)  # of one nothing is known
+    assert "times 0.01" in alignment.explain_edges(trials, trace, now, True, 0.01, 0.1)  # a mesh of 10 cm
 
 
 @pytest.mark.parametrize("mesh_up", ["z x", "x x y", "y x z", "x y w", ""])
