@@ -33,7 +33,8 @@ class Room:
         from iif_core.light.transport.geometry import build_geometry
 
         geometry = build_geometry(mesh.vertices, mesh.faces, np.full(len(mesh.faces), -1, np.int32))
-        return cls(geometry, face_geometry(mesh.vertices, mesh.faces)[0].astype(np.float32), mesh.diagonal)
+        size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+        return cls(geometry, face_geometry(mesh.vertices, mesh.faces)[0].astype(np.float32), size)
 
     def seen(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Return z-depth (H, W) float32 with 0 = miss, and face ids (H, W) with -1 = miss, of a view."""
