@@ -52,7 +52,7 @@ def overview_png(
         axes.plot(dots[:, i], dots[:, j], ",", color="0.4", label="surface that photographs show")
         axes.quiver(centre[:, i], centre[:, j], ahead[:, i], ahead[:, j], color="tab:blue", width=0.003, label="camera")
         axes.set(aspect="equal", xlabel=f"{'xyz'[i]} (m)", ylabel=f"{'xyz'[j]} (m)", title=title)
-    above.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, markerscale=6)
+    above.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8, markerscale=6)
     shown = np.unique(np.linspace(0, len(pictures) - 1, SHOWN).round().astype(int))
     rows = below.subplots(2, len(shown), squeeze=False)
     far = float(np.nanquantile(np.concatenate([z[::4, ::4].ravel() for z in depths]), 0.98))
