@@ -154,21 +154,24 @@ def _lies_on(
 ) -> NDArray:
     """Return (m,) bool: the faces of a mesh whose place the squares of some side take.
 
-    All of such a face is within `thickness` (s,), NaN = never, of a square, and it is about parallel; or it is as near to squares
-    of two sides, where surface is round that should have an edge.
+    `quads` (q, 4) of `corners` lie on the sides `side` (q,), which prolong planes. All of such a face is within `thickness` (s,)
+    of a square, and it is about parallel; or it is as near to squares of two sides, where surface is round that should have an
+    edge.
     """
     normal, middle = face_geometry(vertices, faces)[0], vertices[faces].mean(1)
     parallel, count = np.zeros(len(faces), bool), np.zeros(len(faces), np.int64)
     for number, inward in enumerate(sides.normal):
-        place = float(corners[quads[side == number][:1]].reshape(-1, 3).mean(0) @ inward) if (side == number).any() else np.nan
-        close = np.flatnonzero(np.abs(vertices @ inward - place)[faces].max(1) <= thickness[number])  # never, for NaN
+        own = quads[side == number]
+        if not len(own):
+            continue
+        away = np.abs((vertices - corners[own[0, 0]]) @ inward)
+        close = np.flatnonzero(away[faces].max(1) <= thickness[number])
         if not len(close):
             continue
-        own = quads[side == number]
         foot = closest_points(corners, np.concatenate([own[:, [0, 1, 2]], own[:, [0, 2, 3]]]), middle[close]).points
         off = middle[close] - foot
         beside = np.linalg.norm(off - (off @ inward)[:, None] * inward, axis=1)
-        close = close[beside < 1e-6 + 0.5 * TILE]
+        close = close[beside < 0.5 * TILE]
         count[close] += 1
         parallel[close] |= np.abs(normal[close] @ inward) > PARALLEL
     return parallel | (count > 1)

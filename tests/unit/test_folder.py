@@ -585,6 +585,7 @@ def test_a_convention_that_puts_all_cameras_at_one_point_is_not_proposed(monkeyp
     assert said and "times" not in said
     assert "times 0.001" in alignment.explain_edges(trials[:1], trace, now, True, 0.01, size)  # of one nothing is known
     assert "times 0.01" in alignment.explain_edges(trials, trace, now, True, 0.01, 0.1)  # a mesh of 10 cm
+    assert "mesh_up" in alignment.explain_edges(trials, trace, now, True, 0.01, 1000.0)  # cameras on a wide ground may turn
 
 
 @pytest.mark.parametrize("mesh_up", ["z x", "x x y", "y x z", "x y w", ""])

@@ -135,11 +135,10 @@ class Candidates:
                 impossible.add(rest)
         likely = chosen - unlikely
         if len(chosen - likely) > 1 and (likely or (self.family < 0).any()):
-            found[likely], _, white = self._look(likely)
+            white = self._look(likely)[2]
             likely |= {f for f in chosen - likely if self._must_shine(f, white)}
             if len(chosen - likely) > 1:
-                found[likely] = self._look(likely)[0]
-                largest[likely] = np.inf, 1.0
+                found[likely], largest[likely] = self._look(likely)[0], (np.inf, 1.0)
                 always.add(likely)
         order = sorted(
             found.keys() - impossible, key=lambda f: (found[f] * self.weight(f) * (1.0 + PROMISING) ** len(f), sorted(f))

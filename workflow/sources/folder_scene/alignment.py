@@ -230,12 +230,13 @@ def explain(
         return np.concatenate(parts)
 
     as_is = ratios(conventions)
-    others = [(text, c) for text, c in candidates(conventions, known) if not _at_one_point([f for f, _ in chosen], c, size)]
+    some = [frame for frame, _ in chosen]
+    others = [(text, c) for text, c in candidates(conventions, known) if not _drawn_together(some, conventions, c, size)]
     scores = [(disagreement(ratios(c)), text) for text, c in others]
     if np.isfinite(as_is).any() and any(depth is not None for depth in depths):  # sparse points have no scale of their own
         factor = float(np.nanmedian(as_is))
         scores.append((disagreement(as_is / factor), _unit_advice(conventions.metres, factor)))
-    best, text = min(scores, default=(np.inf, ""))
+    best, text = min(scores)
     return f"{text} (disagreement {best:.1%})" if best <= min(tolerance, 0.5 * disagreement(as_is)) else ""
 
 
@@ -270,15 +271,19 @@ def explain_edges(
             found.append(edge_correlation(*edges)[SHIFT, SHIFT] if (depth > 0).any() else 0.0)
         return float(np.mean(found)) if found else 0.0
 
-    others = [(text, c) for text, c in candidates(conventions, known) if not _at_one_point([t[0] for t in trials], c, size)]
-    best, text = max(((correlation(c), text) for text, c in others), default=(0.0, ""))
+    frames = [frame for frame, *_ in trials]
+    others = [(text, c) for text, c in candidates(conventions, known) if not _drawn_together(frames, conventions, c, size)]
+    best, text = max((correlation(c), text) for text, c in others)
     return f"{text} (edges correlate {best:.2f}, as read {now:.2f})" if best >= max(CLEAR_CORRELATION, 3 * now) else ""
 
 
-def _at_one_point(frames: Sequence[Frame], tried: Conventions, size: float) -> bool:
-    """Several cameras stand together in a mesh of a size (m): what fits then fits by chance."""
-    positions = np.array([tried.pose(frame)[:3, 3] for frame in frames])
-    return len(frames) > 1 and float(np.linalg.norm(np.ptp(positions, axis=0))) < LEAST_SPREAD * size
+def _drawn_together(frames: Sequence[Frame], now: Conventions, tried: Conventions, size: float) -> bool:
+    """A convention moves cameras together, to what is a point in a mesh of a size (m): what fits then fits by chance."""
+
+    def span(conventions: Conventions) -> float:
+        return float(np.linalg.norm(np.ptp([conventions.pose(frame)[:3, 3] for frame in frames], axis=0)))
+
+    return len(frames) > 1 and span(tried) < min(LEAST_SPREAD * size, 0.5 * span(now))
 
 
 def _unit_advice(metres: float, factor: float) -> str:
