@@ -469,6 +469,26 @@ def test_verify_reads_the_notes_of_parts(tmp_path, harm):
     assert all(line.startswith(f"{path}: ") and line.endswith("--forcerun base") for line in lines)
 
 
+def test_a_deliverable_that_the_user_keeps_under_another_name_is_no_damage(tmp_path):
+    chain(tmp_path, "capture", "publish")
+    folder = deliverable(tmp_path)
+    (folder / "report.html").write_text("a page")
+    document = json.loads((folder / "manifest.json").read_text())
+    facts = {"sha256": sha256_of(folder / "report.html"), "bytes": 6}
+    manifests.write(folder / "manifest.json", document | {"fingerprints": {}, "files": {"report.html": facts}})
+    kept = tmp_path / "scenes/before"
+    shutil.copytree(folder, kept)
+    (kept / "room.blend").write_text("of the user")
+    assert not [line for line in damaged(tmp_path) if "before" in line]
+    (kept / "report.html").write_text("a pane")
+    (line,) = [line for line in damaged(tmp_path) if "before" in line]
+    named(line, kept / "report.html", "scenes/s")
+    assert "snakemake" not in line  # there is no scene of that name
+    (tmp_path / "results/before/capture").mkdir(parents=True)  # there is, and this is another's
+    (line, *_) = [line for line in damaged(tmp_path) if line.startswith(f"{kept}/manifest.json: ")]
+    assert "snakemake --cores 2 scenes/before" in line
+
+
 def test_verify_does_not_take_one_variant_for_another(tmp_path):
     chain(tmp_path, "capture", "base", scene="room--v2", home="room--v2", base=["capture"])
     chain(tmp_path, "capture", "base", scene="room--v1", home="room--v1", base=["capture"])

@@ -33,12 +33,27 @@ def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator
     forget()
     for scene in with_artefacts(root) if not scenes else scenes:
         results, harmed = root / "results", False
+        if of := _kept_copy_of(root, scene):
+            yield from _copy(root / "scenes" / scene, of)
+            continue
         for line in _of_results(results, scene):
             harmed = True
             yield line
         yield from (str(links.refused(link)) for link in links.found(results, scene))
         first = "repair results/ first (the lines above), then " if harmed else ""
         yield from _published(root, scene, first)
+
+
+def _kept_copy_of(root: Path, scene: str) -> str:
+    """Return the scene whose deliverable the user keeps under another name, of which nothing was made; "" if this is none."""
+    owner = _document(root / "scenes" / scene / MANIFEST, SCENE_SCHEMA).get("scene", "")
+    return "" if owner == scene or (root / "results" / scene).exists() else owner
+
+
+def _copy(folder: Path, scene: str) -> Iterator[str]:
+    """Yield one line for each file of a kept copy that is not what its own manifest says."""
+    for line in wrong_files(folder, _document(folder / MANIFEST, SCENE_SCHEMA)):
+        yield f"{line}; {folder} is a copy of scenes/{scene}, which no command makes again: copy it anew, or remove it"
 
 
 def _of_results(results: Path, scene: str) -> Iterator[str]:
