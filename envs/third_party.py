@@ -60,6 +60,7 @@ NOTES = {
     "docutils": "public domain and BSD; its mode for Emacs, which is not installed, is GPL 3",
     "hypothesis": MPL + "; only tests import it",
     "pi-heif": "the package is BSD, libheif and libde265 in it are LGPL 3, as shared libraries",
+    "rawpy": "MIT; LibRaw in it LGPL 2.1 or CDDL 1.0, GCC's libgomp GPL 3 with the runtime exception, as shared libraries",
     "pycolmap": "carries GCC's libgfortran and libquadmath (GPL 3 with the runtime exception, LGPL 2.1), as shared libraries",
     "libusb-package": "the package is Apache 2.0, the libusb in it LGPL 2.1 or later, loaded as a shared library",
     "numpy": "carries GCC's libgfortran and libquadmath (GPL 3 with the runtime exception, LGPL 2.1), as shared libraries",

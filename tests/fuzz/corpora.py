@@ -19,6 +19,7 @@ from iif_core.errors import InputError
 from tests.unit import own_scene as own
 from tests.unit import scannetpp_scene as mini
 from tests.unit import test_colmap, test_fipt
+from tests.unit import test_raws as raw
 from workflow import settings
 
 
@@ -220,6 +221,9 @@ def pictures(home: Path) -> None:
     for name in ("a.webp", "a.avif", "a.bmp"):
         Image.fromarray(values).save(home / name)
     shutil.copy(Path(__file__).parents[1] / "unit/photograph.heic", home / "a.heic")
+    large = np.tile(values / 255, (3, 3, 1))  # LibRaw takes less for no photograph
+    raw.save_dng(home / "a.dng", large, opcodes={51009: raw.opcode_list(raw.gain_map(np.full((2, 3), 1.5)))})
+    raw.save_dng(home / "b.dng", large, mosaic=False)
     channels = {c: values[..., i].astype(np.float32) / 255 for i, c in enumerate("RGB")}
     own.save_exr(home / "a.exr", channels)
     own.save_exr(home / "ids.exr", {"id": values[..., 0].astype(np.uint32)})
@@ -530,6 +534,7 @@ TARGETS: dict[str, Target] = {
     "EXR": Target(("a.exr", "ids.exr"), pictures, read_pictures),
     "HEIF": Target(("a.heic", "a.avif"), pictures, read_pictures),
     "TIFF": Target(("a.tif", "b.tif", "c.tif", "a.webp", "a.bmp"), pictures, read_pictures),
+    "raw": Target(("a.dng", "b.dng"), pictures, read_pictures),
     "response": Target(("r.npy", "r.parquet", "r.csv"), responses, read_responses),
     "manifests": Target(
         (

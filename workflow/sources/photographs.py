@@ -16,7 +16,7 @@ from workflow.runtime.job import Job
 from workflow.settings.source import FolderSource
 from workflow.sources import folder
 from workflow.sources.folder_scene import images, transforms
-from workflow.sources.folder_scene.entries import evenly_spread, one_range
+from workflow.sources.folder_scene.entries import evenly_spread, one_range, without_raws
 from workflow.sources.folder_scene.frames import checked_frames, folder_at
 from workflow.sources.folder_scene.inputs import Inputs
 
@@ -49,6 +49,7 @@ def chosen(root: Path, most: int) -> list[str]:
     """
     found = sorted(path for path in root.rglob("*") if path.suffix.lower() in images.EXTENSIONS and path.is_file())
     found = [path for path in found if "masks" not in path.relative_to(root).parts[:-1] and not _hidden(path, root)]
+    found = without_raws(found)
     if len(found) < LEAST:
         kinds = ", ".join(images.EXTENSIONS)
         raise InputError(f"{root}: {len(found)} photographs ({kinds}); at least {LEAST} are needed, some dozens are better")

@@ -13,11 +13,11 @@ import numpy as np
 from iif_core.errors import InputError
 from workflow.intake import limits
 from workflow.intake.names import existing, fault_of_name, same_name, shown
+from workflow.intake.raws import DEVELOP, RAW
 from workflow.sources.folder_scene import images
 
-_RAW = "Develop all of them to linear EXR in sRGB primaries (darktable-cli <name>.DNG <name>.exr), or to JPEG"
 CONVERTERS = {
-    **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), _RAW),
+    **dict.fromkeys((".pef", ".srw", ".x3f", ".3fr", ".iiq", ".rwl"), DEVELOP),
     **dict.fromkeys((".gif", ".jxl", ".jp2"), "Convert all of them: mogrify -format png <files> (ImageMagick)"),
 }
 """What to do with photographs of other formats."""
@@ -178,6 +178,7 @@ def _find_image(path: Path, root: Path, entry: Entry) -> Path:
     if stated.suffix.lower() in images.EXTENSIONS:
         return stated
     found = [c for c in (existing(stated.with_name(stated.name + e)) for e in images.EXTENSIONS) if c.is_file()]
+    found = without_raws(found)
     if len(found) > 1:
         names = " and ".join(c.name for c in found)
         raise InputError(f"{path}: {entry.file_path!r} has no extension and {names} exist; name the one you mean")
@@ -186,6 +187,12 @@ def _find_image(path: Path, root: Path, entry: Entry) -> Path:
         cure = CONVERTERS.get(stated.suffix.lower(), "Convert it")
         raise InputError(f"{stated}: not an image format that is read here; allowed: {allowed}. {cure}")
     return found[0] if found else stated
+
+
+def without_raws(files: list[Path]) -> list[Path]:
+    """Leave out raw files of which the developed photograph lies beside them, as cameras write both."""
+    developed = {(path.parent, same_name(path.stem)) for path in files if path.suffix.lower() not in RAW}
+    return [path for path in files if path.suffix.lower() not in RAW or (path.parent, same_name(path.stem)) not in developed]
 
 
 def _all_present(path: Path, root: Path, missing: list[Path]) -> None:
@@ -209,6 +216,13 @@ def _elsewhere(path: Path, missing: Path) -> str:
 
 
 def one_range(path: Path, files: list[Path], dynamic_range: str) -> None:
+    raw = [f for f in files if f.suffix.lower() in RAW]
+    if raw and len(raw) < len(files):
+        other = next(f for f in files if f.suffix.lower() not in RAW)
+        raise InputError(
+            f"{path}: mixes raw files ({raw[0].name}), which are linear, and developed ones ({other.name}); choose with"
+            " `source.frames`, or move one kind away"
+        )
     hdr = [f for f in files if f.suffix.lower() == ".exr"]
     if hdr and len(hdr) < len(files):
         other = next(f for f in files if f.suffix.lower() != ".exr")

@@ -14,10 +14,13 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.intake.documents import reading
-from workflow.intake.pictures import PHOTOGRAPHS, ExrWindows, exr_chromaticities, exr_windows, opened
+from workflow.intake.pictures import FORMATS, PHOTOGRAPHS, ExrWindows, exr_chromaticities, exr_windows, opened
+from workflow.intake.raws import RAW, raw_header, raw_pixels
 from workflow.sources.folder_scene.profiles import SPACES, Space, converted, linear_conversion, of_16_bits
 
-EXTENSIONS = PHOTOGRAPHS
+EXTENSIONS = PHOTOGRAPHS + RAW
+DEVELOPED, BENT = "raw", "raw, not rectified"
+"""`Photo.form` of raw files; the latter state a distortion that is to be removed."""
 STRIP_PIXELS = 1 << 20
 """Pixels that are converted or reduced at a time, so that a photograph takes little more memory than its result."""
 MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "I;16", "I;16B", "I")
@@ -70,8 +73,8 @@ class Photo:
         pixels: (H, W, 3) float32 sensor values in [0, 1], or radiance.
         valid: (H, W) bool.
         non_finite, transparent, negative, masked, outside: counts of such pixels; outside: of the data window of an EXR.
-        form: format of the file other than 8-bit colour (`grey`, `16-bit`, `16-bit grey`), or the colour space from which it was
-            converted (`in Display P3`), else empty.
+        form: format of the file other than 8-bit colour (`grey`, `16-bit`, `16-bit grey`, `raw`), or the colour space from which
+            it was converted (`in Display P3`), else empty.
     """
 
     pixels: np.ndarray
@@ -89,6 +92,10 @@ def _header(path: Path, _stamp: tuple[int, int]) -> Header:
     if path.suffix.lower() == ".exr":
         windows = exr_windows(path)
         return Header(windows.data, display=None if windows.is_plain else windows.display)
+    if path.suffix.lower() in RAW:
+        raw = raw_header(path)
+        stated = dict(zip((tag for tag, _ in _EXPOSURE_TAGS), (value or None for value in raw.exposure), strict=True))
+        return Header(raw.size, raw.orientation, _stated_exposure(stated))
     with reading(path, "not a readable image"):
         with opened(path) as image:
             if image.mode not in MODES:
@@ -122,7 +129,10 @@ def exif_upright(path: Path) -> tuple[bytes, tuple[str, float]]:
         return b"", ("", 0.0)
     from PIL import Image
 
-    with reading(path, "not a readable image"), opened(path) as image:
+    is_raw = path.suffix.lower() in RAW
+    if is_raw and not _is_tiff(path):
+        return b"", ("", raw_header(path).focal)
+    with reading(path, "not a readable image"), opened(path, ("TIFF",) if is_raw else FORMATS) as image:
         found = image.getexif()
         own = found.get_ifd(_PHOTO_IFD)
         kept = Image.Exif()
@@ -197,10 +207,14 @@ def _png_of_16_bits(path: Path) -> np.ndarray:
     return np.array(mi.Bitmap(str(path)))
 
 
-def _is_16_bit_tiff(path: Path) -> bool:
+def _is_tiff(path: Path) -> bool:
     with open(path, "rb") as file:
-        if file.read(4) not in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
-            return False
+        return file.read(4) in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+
+def _is_16_bit_tiff(path: Path) -> bool:
+    if not _is_tiff(path):
+        return False
     import tifffile
 
     with tifffile.TiffFile(path) as file:
@@ -238,12 +252,15 @@ def _stored(path: Path) -> np.ndarray:
 
 
 def _pixels_of(path: Path, colour: str | None) -> tuple[np.ndarray, str, Space | None]:
-    """Read the pixels of a png or jpg, (H, W) or (H, W, C), integer.
+    """Read the pixels of a png, jpg or raw file, (H, W) or (H, W, C), integer.
 
     With a `colour` (`source.colour`) also from which colour space they were, or are still to be, converted to sRGB, and that
     space in the latter case.
     """
     header(path)
+    if path.suffix.lower() in RAW:
+        pixels, warps = raw_pixels(path)
+        return pixels, BENT if warps else DEVELOPED, SPACES["linear"]
     with reading(path, "cannot be read", "; the file is damaged or cut short"):
         given = SPACES.get(colour or "")
         is_srgb = colour == "srgb"
@@ -357,6 +374,7 @@ def load_photo(path: Path, turn: int = 1, size: tuple[int, int] | None = None, c
             space = space.grey()
             name = name if space is not None else ""
         form = " ".join(["16-bit"] * (stored.dtype.itemsize > 1) + ["grey"] * (channels < 3) + [name] * bool(name))
+        form = name if path.suffix.lower() in RAW else form
 
         def strip(rows: slice) -> tuple[np.ndarray, np.ndarray | None]:
             values = stored[rows].astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)

@@ -10,6 +10,7 @@ import numpy as np
 from iif_core.camera.exposure import ExposureGains
 from iif_core.errors import InputError
 from workflow.scene.normal_form import View
+from workflow.sources.folder_scene import images
 from workflow.sources.folder_scene.frames import Frame
 from workflow.sources.folder_scene.mesh import Mesh
 
@@ -88,7 +89,10 @@ def of_pixels(frames: Sequence[Frame], counts: Mapping[str, int], forms: Sequenc
     }
     out = [f"photographs: {counts[k]} {text}" for k, text in words.items() if counts[k]]
     grey, deep = "the same value in R, G and B", "values / 65535"
+    developed = "developed by LibRaw, linear, in the white balance of daylight"
+    bent = "the files ask to remove the distortion of the lens, which is left in: cameras of their JPEGs do not fit them"
     meaning = {"grey": grey, "16-bit": deep, "16-bit grey": f"{deep}, the same in R, G and B"}
+    meaning |= {images.DEVELOPED: developed, images.BENT: f"{developed}; {bent}"}
     for form in sorted({form for form, _ in forms}):
         count = len({name for own, name in forms if own == form})
         out.append(f"photographs: {count} {form}: {meaning.get(form, 'converted to sRGB')}")
