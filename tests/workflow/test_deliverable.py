@@ -4,9 +4,11 @@ import json
 import shutil
 
 import numpy as np
+import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from support import planned
 
 from workflow.artifacts import swap
 
@@ -118,11 +120,17 @@ def test_files_of_the_user_outlive_a_job_that_fails(workflow):
     assert has_own(scene) and (scene / "report.html").is_file()
 
 
-def test_files_that_are_put_there_while_stages_run_are_kept(workflow):
-    """Long after Snakemake has planned: here by the report, the last stage before."""
+def test_a_name_is_shown_without_a_new_fit_and_files_that_are_put_there_meanwhile_are_kept(workflow):
+    """The files come long after Snakemake has planned: here the stages from `unwrap` on run, for a new name of an object."""
     scene = workflow.folder / "scenes/tiny"
-    (workflow.folder / "config/scenes/tiny.yaml").open("a").write("report: {credit: someone}\n")
+    before = pd.read_csv(scene / "objects.csv").set_index("object_id")["name"]
+    assert "north wall" not in before.tolist()
+    (workflow.folder / "config/scenes/tiny.yaml").open("a").write("names: {0: north wall}\nreport: {credit: someone}\n")
     put(scene)
     result = workflow.run("scenes/tiny")
     assert result.returncode == 0, result.stderr[-4000:]
+    assert planned(result) == {"unwrap", "export", "room", "report", "publish"}
     assert has_own(scene) and "someone" in (scene / "report.html").read_text()
+    after = pd.read_csv(scene / "objects.csv").set_index("object_id")["name"]
+    assert after[0] == "north wall" and after.drop(0).equals(before.drop(0))
+    assert "north wall" in (scene / "room.html").read_text() and b"north wall" in (scene / "scene.glb").read_bytes()

@@ -44,12 +44,7 @@ def find_gauge(job: Job, capture: CaptureReader, names: list[str]) -> Callable[[
         return _lamp_gauge(job, scale.lamp)
     patch = scale.white_patch
     if patch.object is not None:
-        if patch.object not in names:
-            near = ", ".join(sorted(names)[:20])
-            raise InputError(
-                f"affines.scale.white_patch.object: no object {patch.object!r}; there are {near} (segmentation/objects.parquet)"
-            )
-        number = names.index(patch.object)
+        number = object_number(patch.object, names, "affines.scale.white_patch.object")
         return lambda problem, places: Gauge("white_patch", patch.albedo, problem.object_id == number)
     known = {view.name: view for view in capture.used}
     if patch.view not in known:

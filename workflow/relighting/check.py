@@ -30,7 +30,7 @@ def check_relightings(document: dict[str, Any], scene: str, quality: str) -> Non
     """
     entries = require_relighting(document, scene)
     with blamed_on_plan(scene):
-        _check(entries, scene, quality)
+        _check(entries, scene, quality, document.get("names", {}))
 
 
 @contextmanager
@@ -43,10 +43,12 @@ def blamed_on_plan(scene: str) -> Iterator[None]:
         raise InputError("\n".join(f"{where}: {line}" for line in str(error).splitlines())) from None
 
 
-def _check(entries: list[dict[str, Any]], scene: str, quality: str) -> None:
+def _check(entries: list[dict[str, Any]], scene: str, quality: str, names: dict[str, str]) -> None:
     capture, segmentation, emission = (finished(stage, scene, quality) for stage in ("capture", "segmentation", "emission"))
     photographed = CaptureReader(capture) if capture is not None else None
-    inventory = Inventory.read(segmentation, emission) if segmentation is not None and emission is not None else None
+    inventory = None
+    if segmentation is not None and emission is not None:
+        inventory = Inventory.read(segmentation, emission, names)
     vertices = photographed.mesh()[0] if photographed else None
     problems = Problems()
     for entry in entries:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from iif_core.errors import InputError
 from iif_core.numerics.color import luminance
 from workflow.artifacts import StageReader
-from workflow.scene.named import object_names, object_number
+from workflow.scene.named import object_names, object_number, renamed
 from workflow.settings.names import did_you_mean
 
 Array = np.ndarray
@@ -34,14 +34,21 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Inventory:
-    """Names of a room; `names` has one entry per object id."""
+    """Names of a room.
+
+    Attributes:
+        names: one per object id, as the segmentation gives them.
+        lamps: that were kept.
+        shown: the same as people see them (setting `names`); empty where none has another name.
+    """
 
     names: list[str]
     lamps: list[Lamp]
+    shown: Sequence[str] = ()
 
     @staticmethod
-    def read(segmentation: StageReader, emission: StageReader) -> Inventory:
-        """Read the lamps that stage emission kept, and the objects of the segmentation."""
+    def read(segmentation: StageReader, emission: StageReader, wanted: Mapping[str, str]) -> Inventory:
+        """Read the lamps that stage emission kept, and the objects of the segmentation; `wanted` is the setting `names`."""
         table, faces = emission.table("emitters.parquet"), emission.table("emitter_faces.parquet")
         object_id = segmentation.table("faces.parquet")["object_id"]
         lamps = []
@@ -51,11 +58,16 @@ class Inventory:
             emitter = int(table["emitter_id"][row])
             own = np.unique(object_id[faces["face_id"][faces["emitter_id"] == emitter]])
             lamps.append(Lamp(emitter, tuple(int(o) for o in own if o >= 0), float(power[row])))
-        return Inventory(object_names(segmentation), lamps)
+        names = object_names(segmentation)
+        return Inventory(names, lamps, renamed(names, wanted))
 
     def name_of(self, lamp: Lamp) -> str:
         """Return the names of the objects that a lamp is on, or its number where it is on none."""
-        return " + ".join(self.names[o] for o in lamp.objects) or f"lamp {lamp.emitter_id}"
+        return " + ".join((self.shown or self.names)[o] for o in lamp.objects) or f"lamp {lamp.emitter_id}"
+
+    def is_called(self, number: int, key: str) -> bool:
+        """Return whether a key of the settings is the name of an object, as people see it or as the segmentation gave it."""
+        return key == self.names[number] or key in self.shown[number : number + 1]
 
     def lamps_called(self, key: str, where: str) -> list[int]:
         """Return the places in `lamps` that a key of the settings means: one by its id (`emitter 5`, or `5` where no object is
@@ -67,13 +79,14 @@ class Inventory:
         exact = re.fullmatch(r"emitter (\d+)", key)
         if exact and any(lamp.emitter_id == int(exact[1]) for lamp in self.lamps):
             return [i for i, lamp in enumerate(self.lamps) if lamp.emitter_id == int(exact[1])]
-        by_name = [i for i, lamp in enumerate(self.lamps) if key in [self.names[o] for o in lamp.objects]]
+        by_name = [i for i, lamp in enumerate(self.lamps) if any(self.is_called(o, key) for o in lamp.objects)]
         found = by_name or [i for i, lamp in enumerate(self.lamps) if key == str(lamp.emitter_id)]
         if found:
             return found
         there = ", ".join(f"{lamp.emitter_id} ({self.name_of(lamp)})" for lamp in self.lamps[:8]) or "none"
-        hint = did_you_mean(key, [self.names[o] for lamp in self.lamps for o in lamp.objects], "{!r}")
-        what = f"object {key!r} does not shine" if key in self.names else f"there is no lamp {key!r}"
+        hint = did_you_mean(key, [(self.shown or self.names)[o] for lamp in self.lamps for o in lamp.objects], "{!r}")
+        is_there = any(self.is_called(o, key) for o in range(len(self.names)))
+        what = f"object {key!r} does not shine" if is_there else f"there is no lamp {key!r}"
         raise InputError(f"{where}: {what}.{hint} Lamps of this room: {there}; ids are in emitters.parquet")
 
     def expanded(self, entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:

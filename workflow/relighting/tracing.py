@@ -19,6 +19,7 @@ from workflow.relighting.world import World, build_world
 from workflow.runtime import device
 from workflow.runtime.fingerprint import raw_digest
 from workflow.runtime.job import Job
+from workflow.scene.named import new_names
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import Recovered, read_recovered
 from workflow.settings.relight import key_of
@@ -46,7 +47,7 @@ class Studio:
     def open(job: Job) -> Studio:
         """Read what stages before left; the job needs capture, segmentation, base, emission and affines upstream."""
         capture, room = CaptureReader(job.read("capture")), read_recovered(job)
-        inventory = Inventory.read(job.read("segmentation"), job.read("emission"))
+        inventory = Inventory.read(job.read("segmentation"), job.read("emission"), new_names(job))
         return Studio(job, capture, room, inventory, capture.up / np.linalg.norm(capture.up))
 
     def flight(self, entry: dict[str, Any]) -> Flight:

@@ -181,10 +181,8 @@ def _moved(
     for key, move in moves.items():
         for place in inventory.lamps_called(key, "relight.lamps"):
             lamp = inventory.lamps[place]
-            by_object = key in [inventory.names[o] for o in lamp.objects]
             own = room.emitter_id == lamp.emitter_id
-            if by_object:
-                named = [o for o in lamp.objects if inventory.names[o] == key]
+            if named := [o for o in lamp.objects if inventory.is_called(o, key)]:
                 own = np.isin(surface.object_id, named)
             shift[own] = np.asarray(move, np.float32)
     goes = np.flatnonzero(shift.any(1))

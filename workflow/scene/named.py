@@ -11,6 +11,7 @@ from iif_core.errors import InputError
 from workflow.artifacts import StageReader
 from workflow.registry import upstream_of
 from workflow.runtime import fingerprint as fp
+from workflow.runtime.job import Job
 from workflow.settings import scene_origin
 from workflow.settings.names import did_you_mean
 
@@ -37,20 +38,22 @@ def object_number(key: object, names: list[str], where: str) -> int:
 
 @lru_cache(None)
 def check_overrides(stage: str, scene: str, quality: str) -> None:
-    """Check the objects that `materials` names, once the segmentation is known. Every later stage checks them before its work,
-    not only stage `affines`, which is the first to use them.
+    """Check the objects that `materials` and `names` name, once the segmentation is known. Every later stage checks them before
+    its work, not only stage `affines`, which is the first to use them.
 
     Raises:
         InputError: as `object_number`.
     """
-    wanted = json.loads(fp.resolved(scene, quality))["materials"]
-    if not wanted or "segmentation" not in upstream_of(stage):
+    document = json.loads(fp.resolved(scene, quality))
+    wanted, new = document["materials"], document["names"]
+    if not (wanted or new) or "segmentation" not in upstream_of(stage):
         return
     reader = finished("segmentation", scene, quality)
     if reader is not None:
         names = object_names(reader)
         for key in wanted:
             object_number(key, names, f"{scene_origin(scene)}: `materials`")
+        renamed(names, new, f"{scene_origin(scene)}: `names`")
 
 
 def object_names(segmentation: StageReader, n_objects: int | None = None) -> list[str]:
@@ -61,6 +64,34 @@ def object_names(segmentation: StageReader, n_objects: int | None = None) -> lis
     for i, name in zip(table["object_id"], table["name"], strict=True):
         names[int(i)] = str(name)
     return names
+
+
+def renamed(names: list[str], wanted: dict[str, str], where: str = "`names`") -> list[str]:
+    """Return the names of objects with those of the setting `names` in their place.
+
+    Raises:
+        InputError: there is no such object, two keys mean one, or another object has a new name already.
+    """
+    out, given = list(names), {}
+    for key, name in wanted.items():
+        number = object_number(key, names, where)
+        if number in given:
+            raise InputError(f"{where}: {given[number]!r} and {key!r} are the same object; keep one of the two lines")
+        out[number], given[number] = name, key
+    for number, name in enumerate(out):
+        if number not in given and name in wanted.values():
+            raise InputError(f"{where}: object {number} is called {name!r} already; choose another name, or rename that too")
+    return out
+
+
+def new_names(job: Job) -> dict[str, str]:
+    """Return the setting `names`; nothing in stages that do not read it, so that they do not run again for a name."""
+    return vars(job.settings.names) if "names" in job.stage.settings else {}
+
+
+def shown_names(job: Job, n_objects: int | None = None) -> list[str]:
+    """Return the names of all objects as people see them, in stages that read the setting `names`."""
+    return renamed(object_names(job.read("segmentation"), n_objects), new_names(job))
 
 
 def finished(stage: str, scene: str, quality: str) -> StageReader | None:

@@ -13,7 +13,7 @@ from iif_core.reflectance.material import CHANNELS, IDENTITY, apply_affines
 from workflow.artifacts.store import StageReader
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_base, read_lit_scene
-from workflow.scene.named import object_names
+from workflow.scene.named import shown_names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ def read_recovered(job: Job) -> Recovered:
     """
     base, light = read_lit_scene(job)
     affines, emission = job.read("affines"), job.read("emission")
-    names = object_names(job.read("segmentation"), base.n_objects)
+    names = shown_names(job, base.n_objects)
     cells = read_base(job).table("cells.parquet", ("cell_id", *"xyz"))
     fitted = affines.table("cells.parquet", ("cell_id", *CHANNELS))
     if not np.array_equal(cells["cell_id"], fitted["cell_id"]):

@@ -9,7 +9,7 @@ from pydantic import Field, field_validator, model_validator
 
 from workflow import plugins
 from workflow.settings import affines, base, light, outputs, source
-from workflow.settings.by_hand import ByObject, Components
+from workflow.settings.by_hand import ByObject, Components, Names, by_former_names
 from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES
 from workflow.settings.limits import Limits
 from workflow.settings.prior import LearnedPrior, Member, Prior
@@ -63,6 +63,9 @@ class SceneSettings(Section):
     materials: ByObject = Field(default_factory=dict)
     """Corrections by hand: name or id of an object -> its `roughness`, `metallic` or both, which are then not fitted
     (docs/guide/relighting.md#corrections-by-hand)."""
+    names: Names = Field(default_factory=dict)
+    """What objects are called: name or id of an object -> its new name, in tables, exports, `room.html`, the report, `materials`
+    and relightings (docs/guide/segmentation.md#names)."""
     relight_title: str = ""
     """Title of the contact sheet of `relight`; plans of relightings have `title`."""
     relight: Relightings = Field(default_factory=list)
@@ -84,6 +87,23 @@ class SceneSettings(Section):
     @classmethod
     def _geometry_unless_named(cls, value: Any) -> Any:
         return {"kind": "geometry", **value} if isinstance(value, dict) else value
+
+    @model_validator(mode="after")
+    def _names_of_the_segmentation(self) -> SceneSettings:
+        """Keep objects by the names that the segmentation gives them, so that another name makes no fit run again."""
+        if not self.names:
+            return self
+        object.__setattr__(self, "materials", by_former_names(self.materials, self.names))
+        entries = [
+            entry.model_copy(update={"materials": by_former_names(entry.materials, self.names)}) for entry in self.relight
+        ]
+        object.__setattr__(self, "relight", entries)
+        patch = getattr(self.affines.scale, "white_patch", None)
+        if patch is not None and patch.object is not None:
+            (known,) = by_former_names({patch.object: None}, self.names)
+            scale = self.affines.scale.model_copy(update={"white_patch": patch.model_copy(update={"object": known})})
+            object.__setattr__(self, "affines", self.affines.model_copy(update={"scale": scale}))
+        return self
 
     @model_validator(mode="after")
     def _automatic_noise(self) -> SceneSettings:

@@ -16,6 +16,7 @@ from workflow.exporters.object_table import csv_bytes, recovered_objects
 from workflow.exporters.usd import BASE_COLOR, SURFACE, usd_bytes
 from workflow.relighting.inventory import Inventory
 from workflow.runtime.job import Job
+from workflow.scene.named import new_names
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.picture_facts import view_attributes
 from workflow.scene.recovered import read_recovered, read_response
@@ -57,7 +58,7 @@ def run(job: Job) -> None:
     job.writer.bytes("scene.usdc", usd_bytes(taken, up, environment, capture.views, provenance))
     for name, data in mitsuba_files(taken, atlas, capture.views[:MAX_SENSORS], environment).items():
         job.writer.bytes(f"mitsuba/{name}", data)
-    inventory = Inventory.read(job.read("segmentation"), job.read("emission"))
+    inventory = Inventory.read(job.read("segmentation"), job.read("emission"), new_names(job))
     lamps = {lamp.emitter_id: inventory.name_of(lamp) for lamp in inventory.lamps if lamp.objects}
     emitters = emitter_columns(job.read("emission").table("emitters.parquet"), lamps, recovered.light_scale)
     job.writer.table("emitters.parquet", emitters, UNITS)

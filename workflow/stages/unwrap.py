@@ -9,7 +9,7 @@ from iif_core.surface.triangles import face_geometry
 from workflow.exporters.surface import Part, SeenSurface, build_parts, seen_sides
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_lit_scene
-from workflow.scene.named import object_names
+from workflow.scene.named import shown_names
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import emitter_of_faces
 
@@ -32,7 +32,7 @@ def run(job: Job) -> None:
         base.vertices,
         base.faces,
         base.object_id,
-        object_names(job.read("segmentation"), n_objects),
+        shown_names(job, n_objects),
         emitter_id,
         light.side,
         front,
