@@ -10,7 +10,7 @@ from typing import Any
 
 from workflow.artifacts.files import read_record, write_atomically
 from workflow.costs.size import size_of_capture
-from workflow.costs.work import work_of
+from workflow.costs.work import SceneSize, work_of
 from workflow.registry import SHARED, STAGES
 
 MEASURES = ("cpu_seconds", "seconds", "memory_mb", "disk_mb")
@@ -46,7 +46,7 @@ def _row(path: Path, manifest: dict[str, Any], known: dict[tuple[str, str], dict
     if stage not in STAGES or not timings.is_file():
         return None
     upstream = _upstream(manifest, known)
-    if upstream is None or "capture" not in upstream:
+    if upstream is None or ("capture" not in upstream and stage != "reconstruction"):
         return None
     settings: dict[str, Any] = {}
     for one in upstream.values():
@@ -57,7 +57,8 @@ def _row(path: Path, manifest: dict[str, Any], known: dict[tuple[str, str], dict
                 node = node.setdefault(parent, {})
             node[leaf] = {**node[leaf], **value} if isinstance(node.get(leaf), dict) else value
     job = json.loads(timings.read_text())["job"]
-    size = size_of_capture(upstream["capture"])
+    count = len(manifest.get("raw", {}))
+    size = size_of_capture(upstream["capture"]) if "capture" in upstream else SceneSize(count, 0.0, 0.0, photographs=count)
     try:
         work = work_of(stage, settings, size)
     except KeyError:  # of an older version, which had other settings

@@ -45,6 +45,11 @@ def test_what_is_read_decides_where_specular_light_is_traced_and_how_noisy_diffu
     assert (shading["pixels"], shading["noise"]) == (pixels, noise)
 
 
+def test_a_decimal_comma_is_told(scene):
+    with refused("config/scenes/x.yaml", "source.room_height", "'2,6'", "2.6"):
+        settings.load("x", "draft", scene("source: {kind: photographs, path: a, room_height: '2,6'}\n"))
+
+
 def test_noise_of_the_light_can_be_set(scene):
     for text in ("0.05", "5e-2", "'0.05'"):  # YAML reads a number without a dot and with an exponent as a word
         assert settings.load("x", "draft", scene(f"{GOOD}shading: {{noise: {text}}}\n")).shading.noise == 0.05

@@ -56,6 +56,16 @@ def test_a_hopeless_capture_says_so_first():
     assert "factor of 4.70" in said["scale"].text and "white patch" in said["scale"].remedy
 
 
+def test_what_to_do_about_a_mesh_that_was_found_from_photographs():
+    """It has no axes to set and no scan to mend."""
+    poor = dataclasses.replace(GOOD, escape=0.6, edges=0.02, agreement=0.2, depth=None)
+    given, found = (judge(dataclasses.replace(poor, from_photographs=own)).lights[0] for own in (False, True))
+    remedies = {" ".join(finding.remedy for finding in light.findings) for light in (given, found)}
+    assert len(remedies) == 2 and [f.level for f in given.findings] == [f.level for f in found.findings]
+    (said,) = remedies - {" ".join(finding.remedy for finding in given.findings)}
+    assert "overview.png" in said and "source." not in said and "scan" not in said and "COLMAP" not in said
+
+
 def test_nothing_that_lights_the_room():
     assert changed(lamps=0)["light"] == RED
     finding = judge(dataclasses.replace(GOOD, lamps=0)).lights[1].findings[0]

@@ -10,6 +10,7 @@ from typing import Any
 from workflow import plugins
 from workflow.costs.work import SceneSize
 from workflow.intake.pictures import PHOTOGRAPHS
+from workflow.intake.raws import RAW
 
 EXTRAS = {"truth", "masks", "instances", "depth", "predictions"}
 """Folders of a scene whose pictures are not photographs (docs/guide/own-data.md#4-the-folder)."""
@@ -45,12 +46,13 @@ def estimate(document: dict[str, Any], files: list[Path]) -> SceneSize:
     rendered = plugins.function("SIZES", source["kind"])
     if rendered:
         return SceneSize(capture["views"], float(capture["views"] * box[0] * box[1]), rendered(source, faces))
-    images = [path for path in bytes_ if path.suffix.lower() in PHOTOGRAPHS and not _is_extra(path)]
+    images = [path for path in bytes_ if path.suffix.lower() in PHOTOGRAPHS + RAW and not _is_extra(path)]
     views = min(capture["views"], max(len(images), 1))
     width, height = _picture(images[0], box) if images else box
     scale = min(1.0, box[0] / width, box[1] / height)
     pixels = views * max(round(width * scale), 1) * max(round(height * scale), 1)
-    return SceneSize(views, float(pixels), faces, sum(bytes_.values()) / 1e6)
+    unplaced = min(len(images), source["most"]) if source["kind"] == "photographs" else 0
+    return SceneSize(views, float(pixels), faces, sum(bytes_.values()) / 1e6, photographs=unplaced)
 
 
 def _is_extra(path: Path) -> bool:

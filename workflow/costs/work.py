@@ -33,6 +33,7 @@ class SceneSize:
         faces: of the mesh.
         source_mb: size of the files that `capture` reads, in MB; 0 where it renders the photographs.
         exact: whether these are counts of a finished capture, or estimates from settings and headers of files.
+        photographs: whose cameras are to be found; 0 where they are known.
     """
 
     views: int
@@ -40,6 +41,7 @@ class SceneSize:
     faces: float
     source_mb: float = 0.0
     exact: bool = False
+    photographs: int = 0
 
 
 class Work(NamedTuple):
@@ -208,7 +210,9 @@ def _publish(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, 
 
 
 def _reconstruction(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
-    return "photographs", {"views": size.views / 100}
+    depth = size.photographs * settings["source"].get("detail", 0) ** 2 / MILLION
+    # Every photograph is matched with every other one.
+    return "photographs", {"photographs": size.photographs / 100, "pairs": (size.photographs / 100) ** 2, "depth": depth}
 
 
 _STAGES = {

@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +30,7 @@ _LEAST_CROP = 0.8
 """Share of the pixels that the crop of a file keeps at least; with less it is no border of the sensor."""
 _OPCODES_OF_THE_MOSAIC, _OPCODES_OF_THE_PICTURE = 51009, 51022
 _WARPS, _VIGNETTE, _BAD_PIXELS, _GAIN_MAP = (1, 2), 3, (4, 5), 9
-_MOST_OPCODES, _MOST_POINTS = 1000, 1 << 20
+_MOST_OPCODES, _MOST_POINTS, _MOST_PAGES = 1000, 1 << 20, 16
 _LARGEST_GAIN = 64.0
 
 
@@ -222,7 +223,8 @@ def _lists(path: Path) -> Iterator[tuple[int, bytes]]:
     import tifffile
 
     with tifffile.TiffFile(path) as file:
-        pages = [page for first in file.pages for page in (first, *(first.pages or ()))]
+        # Of a damaged file the list of pages has no end.
+        pages = [page for first in islice(file.pages, _MOST_PAGES) for page in (first, *islice(first.pages or (), _MOST_PAGES))]
         own = [page for page in pages if int(page.photometric) in (32803, 34892)]  # a mosaic, or linear colours
         if not own:
             return

@@ -11,6 +11,7 @@ from workflow.decisions import numerics
 from workflow.report.reported import Reported
 from workflow.report.scores import found
 from workflow.report.verdict import Evidence
+from workflow.scene.normal_form import CaptureReader
 
 NUMERICS = ("base", "emission", "shading", "affines")
 """Stages that say where their arithmetic came close to its end."""
@@ -19,6 +20,11 @@ BRIGHT = 12.0
 lamp was 3 to 11 times as bright, window panes and lamp shades 11 to 80 times (lab/notebook/verdicts.md)."""
 SHOWN = 0.2
 """A lamp that fewer pixels show than this share of what surface of its area has on average is hardly photographed."""
+
+
+def _source_of(capture: CaptureReader) -> str:
+    """Return the kind of source that a capture was made from; "" where its manifest does not say."""
+    return capture.reader.manifest.get("settings", {}).get("source", {}).get("kind", "")
 
 
 def evidence_of(scene: Reported) -> Evidence:
@@ -54,6 +60,7 @@ def evidence_of(scene: Reported) -> Evidence:
         edges=alignment.get("edge_correlation"),
         edges_warn=any("may not be aligned" in str(note) for note in capture.facts.get("notes", [])),
         agreement=float(np.median(agreement)) if agreement else None,
+        from_photographs=_source_of(capture) == "photographs",
         photographs=len(capture.views),
         lost=len(capture.facts.get("dropped_views") or ()) + len(capture.facts.get("left_out_views") or ()),
         photographed=float(cache[-1]) if cache else scene.document("plan").get("probes", {}).get("photographed_share"),

@@ -115,6 +115,7 @@ class Evidence:
         depth: median disagreement of mesh and measured depth.
         edges: correlation of edges of photographs and mesh; edges_warn: whether the source found it too weak.
         agreement: median correlation of a photograph with what the others show of the same surface.
+        from_photographs: whether cameras and mesh were found from the photographs alone.
         photographs: number of photographs; lost: how many were left out of those given.
         photographed: share of the surface met by rays from surface that photographs show.
         stability: of the objects; None also where objects are given.
@@ -140,6 +141,7 @@ class Evidence:
     edges: float | None = None
     edges_warn: bool = False
     agreement: float | None = None
+    from_photographs: bool = False
     photographs: int = 0
     lost: int = 0
     photographed: float | None = None
@@ -324,12 +326,23 @@ def _warned(e: Evidence, stages: Sequence[str]) -> list[Finding]:
     ]
 
 
+FROM_PHOTOGRAPHS = (
+    "Look at reconstruction/overview.png: cameras stand where you stood, and walls where they are. Where it is wrong, take more"
+    " photographs in between (docs/guide/programs.md#photographs-alone)"
+)
+"""What to do about a mesh that was found from the photographs alone, which does not fit them."""
+
+
 def _geometry(e: Evidence) -> Light:
     lost = e.lost / max(e.photographs + e.lost, 1)
     edges = None
     if e.edges is not None:
         level = max(LIMITS["edges"].level(e.edges), AMBER if e.edges_warn else GREEN, key=ORDER.index)
-        remedy = "Look at the pictures 'alignment'; check source.axes, source.unit, and that each photograph has its own pose"
+        remedy = (
+            FROM_PHOTOGRAPHS
+            if e.from_photographs
+            else "Look at the pictures 'alignment'; check source.axes, source.unit, and that each photograph has its own pose"
+        )
         # Measured depth is stronger evidence than edges, which a room without texture hardly has.
         level = min(level, AMBER, key=ORDER.index) if e.depth is not None else level
         edges = Finding(level, f"Edges of photographs and mesh correlate by {e.edges:.2f}", "" if level == GREEN else remedy)
@@ -340,6 +353,8 @@ def _geometry(e: Evidence) -> Light:
         [
             _finding(
                 "escape", e.escape, f"{{}} of the rays from surfaces leave the mesh{camera}",
+                "Photograph the walls, floor and ceiling that are missing, each from three places, and add them"
+                if e.from_photographs else
                 "Close the mesh: scan the walls, floor and ceiling that it lacks, because they reflect light and keep light out"
                 " (docs/guide/own-data.md)", ".1%",
             ),
@@ -350,6 +365,7 @@ def _geometry(e: Evidence) -> Light:
             edges,
             _finding(
                 "agreement", e.agreement, "Photographs of the same surface correlate by {} (median)",
+                FROM_PHOTOGRAPHS if e.from_photographs else
                 "Refine the poses where they were made (COLMAP, the phone's app); source.registration mends a few pixels",
                 ".2f",
             ),

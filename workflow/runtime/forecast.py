@@ -54,7 +54,10 @@ def job_work(stage: str, scene: str, quality: str) -> Work:
     Raises:
         InputError: the settings or files of the scene cannot be used.
     """
-    return work_of(stage, fingerprints.parsed(fingerprints.resolved(scene, quality)), scene_size(scene, quality))
+    document = fingerprints.parsed(fingerprints.resolved(scene, quality))
+    if stage == "reconstruction":  # a finished capture does not tell how many photographs it had
+        return work_of(stage, document, estimate(document, fingerprints.raw_inputs(stage, document)))
+    return work_of(stage, document, scene_size(scene, quality))
 
 
 def job_cost(stage: str, scene: str, quality: str, threads: int = 2, machine: float | None = None) -> Cost:

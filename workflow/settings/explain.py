@@ -173,6 +173,8 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
                 what = f'Needed: text; YAML reads it as a number, so write it in quotes, such as "{found:03}"'
             elif kind == "string_pattern_mismatch" and where[-1] == "name":
                 what = "Needed: letters, digits, _ and -, beginning with a letter or a digit"
+            elif kind == "float_parsing" and re.fullmatch(r"-?\d+,\d+", str(found)):
+                what += f", with a point: {str(found).replace(',', '.')}"
             hint = did_you_mean(found, re.findall(r"'([^']*)'", what)) if isinstance(found, str) else ""
             lines.append(f"{path}: `{dotted}`: found {said}. {what}.{hint}")
     if len(problems) > SHOWN:

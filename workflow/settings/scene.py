@@ -94,9 +94,7 @@ class SceneSettings(Section):
         if not self.names:
             return self
         object.__setattr__(self, "materials", by_former_names(self.materials, self.names))
-        entries = [
-            entry.model_copy(update={"materials": by_former_names(entry.materials, self.names)}) for entry in self.relight
-        ]
+        entries = [entry.model_copy(update={"materials": by_former_names(entry.materials, self.names)}) for entry in self.relight]
         object.__setattr__(self, "relight", entries)
         patch = getattr(self.affines.scale, "white_patch", None)
         if patch is not None and patch.object is not None:
