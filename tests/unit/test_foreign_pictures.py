@@ -388,6 +388,59 @@ def test_dark_surface_is_no_border(tmp_path, hidden):
     assert not any("border" in note for note in capture.facts["notes"])
 
 
+# ------------------------------------------------------------------------------------- what is written into photographs
+
+
+def dated(root, text, count=12, size=(320, 240), suffix=".jpg", seed=0):
+    """Return what is found in photographs of a wall with a pattern that moves, each with a text at the lower right."""
+    from types import SimpleNamespace
+
+    from PIL import ImageDraw, ImageFont
+
+    width, height = size
+    rng = np.random.default_rng(seed)
+    wall = np.kron(rng.uniform(0.1, 0.9, (90, 120, 3)), np.ones((width // 26, width // 26, 1)))
+    frames = []
+    for i in range(count):
+        row, column = rng.integers(0, wall.shape[0] - height), rng.integers(0, wall.shape[1] - width)
+        picture = Image.fromarray(np.rint(255 * wall[row : row + height, column : column + width]).astype(np.uint8))
+        if text(i):
+            font = ImageFont.load_default(height // 15)
+            ImageDraw.Draw(picture).text((0.62 * width, 0.88 * height), text(i), fill=(255, 150, 20), font=font)
+        path = root / f"{i:03d}{suffix}"
+        picture.save(path)
+        frames.append(SimpleNamespace(image=path, camera=SimpleNamespace(width=width, height=height)))
+    found = borders.find_borders(frames, True, lambda frame: images.load_photo(frame.image))
+    return found.get(size)
+
+
+@pytest.mark.parametrize("size", [(320, 240), (640, 480)])
+def test_a_date_that_is_written_into_photographs_is_left_out(tmp_path, size):
+    found = dated(tmp_path, lambda i: f"2026-11-{i + 10}", size=size)
+    width, height = size
+    rows, columns = np.nonzero(found.written)
+    assert not found.border.any() and 0.003 < found.written.mean() < 0.04
+    assert rows.min() > 0.8 * height and 0.5 * width < columns.min() < 0.63 * width
+    inside = found.written[int(0.9 * height) : int(0.93 * height), int(0.63 * width) : int(0.8 * width)]
+    assert inside.all()  # also the digits that change
+    (note,) = borders.notes_of({size: found})
+    assert "source.borders" in note and f"{width}x{height}" in note
+
+
+@pytest.mark.parametrize("text", [lambda i: "", lambda i: f"{i} of 12" if i % 2 else ""])
+def test_a_pattern_that_moves_is_nothing_written(tmp_path, text):
+    assert all(dated(tmp_path, text, seed=seed) is None for seed in range(3))
+
+
+def test_a_camera_that_stands_still_has_written_nothing(tmp_path):
+    from types import SimpleNamespace
+
+    wall = np.kron(np.random.default_rng(0).uniform(0.1, 0.9, (24, 32)), np.ones((10, 10)))
+    photo = images.Photo(np.repeat(wall[..., None], 3, -1).astype(np.float32), np.ones(wall.shape, bool))
+    one = SimpleNamespace(image=tmp_path / "a.png", camera=SimpleNamespace(width=320, height=240))
+    assert borders.find_borders([one] * 12, True, lambda _: photo) == {}
+
+
 def test_a_dark_frame_that_is_not_black_is_surface():
     pixels = np.full((20, 30, 3), 0.5)
     pixels[:4] = 6 / 255

@@ -30,7 +30,7 @@ class PhotographedSource(Section):
     the correction, and leave out blurred and badly posed photographs. `off`: use them as given."""
     borders: Literal["leave_out", "keep"] = "leave_out"
     """`leave_out`: black pixels that hang together with the edge in most photographs are no surface: borders of photographs whose
-    distortion was removed without cropping, letterboxes."""
+    distortion was removed without cropping, letterboxes. Nor is what is written into nearly all of them, such as a date."""
     close_holes: float = Field(0.5, ge=0)
     """Close holes of the mesh up to so many metres across, where the filling continues the surface around; 0: leave them open.
     Through a hole light is lost, and comes in that was never there."""

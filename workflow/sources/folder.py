@@ -111,7 +111,7 @@ def capture_photographs(job: Job, inputs: Inputs) -> None:
 @dataclass(frozen=True)
 class _Task:
     """What the photographs of a scene are taken with; `splits`: `train` or `test` for each frame, once that is known; `borders`:
-    of the photographs of each size that have one."""
+    of the photographs of each size that have some."""
 
     inputs: Inputs
     source: Any
@@ -119,7 +119,7 @@ class _Task:
     conventions: alignment.Conventions
     room: Room
     splits: Sequence[str] = ()
-    borders: Mapping[borders.Size, np.ndarray] = field(default_factory=dict)
+    borders: Mapping[borders.Size, borders.Unpictured] = field(default_factory=dict)
 
     @property
     def encoded(self) -> bool:
@@ -138,8 +138,8 @@ class _Task:
 
     def photograph(self, frame: Frame, view: View, gain: float) -> Photograph:
         """Decode the photograph of a frame at the size of its view."""
-        border = self.borders.get((frame.camera.width, frame.camera.height))
-        return photograph(frame, view, self.encoded, gain, border)
+        found = self.borders.get((frame.camera.width, frame.camera.height))
+        return photograph(frame, view, self.encoded, gain, None if found is None else found.all)
 
     def view(self, frame: Frame, pose: np.ndarray, number: int, gain: float, longest: float = np.inf) -> View:
         """Return the camera of a frame in the size of the capture, or `longest` if that is less."""
