@@ -399,6 +399,29 @@ def message(run, *arguments):
     return str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "name, text, said",
+    [
+        ("registration.csv", "#name,x,y,alt,heading,pitch,roll,f\n", "#realityscan"),
+        ("images/0001.xmp", "<x:xmpmeta/>", "#realityscan"),
+        ("room.psx", "", "#metashape"),
+        ("room.blend", "BLENDER", "#blender"),
+        ("scan.zip", "PK", "unpack"),
+    ],
+)
+def test_files_of_programs_that_hold_no_cameras_are_pointed_out(tmp_path, name, text, said):
+    path = own.project(tmp_path)
+    (path / name).parent.mkdir(parents=True)
+    (path / name).write_text(text)
+    with refused("data/own", name) as error:
+        own.run(tmp_path, "capture")
+    (path / name).rename(path / f"{Path(name).stem}.csv")
+    (path / f"{Path(name).stem}.csv").write_text("notes,of mine\n")
+    with refused("data/own") as other:
+        own.run(tmp_path, "capture")
+    assert said in str(error.value) and said not in str(other.value)
+
+
 def test_cameras_under_another_name_and_in_a_folder_below_are_pointed_out(tmp_path, shots):
     path = metashape(tmp_path, shots)
     (path / "cameras.xml").rename(path / "my cameras.xml")

@@ -114,8 +114,25 @@ def _cameras(folder: Path, source: dict[str, Any], capture: dict[str, Any], poin
     )
 
 
+FOREIGN = {
+    ".csv": "what RealityScan calls camera parameters; export Registration, COLMAP text (docs/guide/programs.md#realityscan)",
+    ".xmp": "what RealityScan writes beside photographs; export Registration, COLMAP text (docs/guide/programs.md#realityscan)",
+    ".rcproj": "a project of RealityScan; export Registration, COLMAP text (docs/guide/programs.md#realityscan)",
+    ".psx": "a project of Metashape; export its cameras as XML (docs/guide/programs.md#metashape)",
+    ".psz": "a project of Metashape; export its cameras as XML (docs/guide/programs.md#metashape)",
+    ".mg": "a project of Meshroom; its cameras are in cameras.sfm of a later step (docs/guide/programs.md#meshroom)",
+    ".nvm": "cameras of VisualSFM; `colmap model_converter` or RealityScan's COLMAP text brings them here",
+    ".out": "cameras of Bundler; export them as a COLMAP model",
+    ".blend": "a file of Blender; export its cameras (docs/guide/programs.md#blender)",
+    ".r3d": "a recording of Record3D; unpack it (docs/guide/programs.md#record3d)",
+    ".zip": "an archive; unpack it there",
+}
+"""Files of other programs that hold no cameras as they are read here -> what they are, and what to do."""
+
+
 def _hint(folder: Path) -> str:
-    """Say which file may be meant, or that the capture lies one folder further down, as archives are often unpacked."""
+    """Say which file may be meant, what lies there instead, or that the capture lies one folder further down, as archives are
+    often unpacked."""
     found = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in photogrammetry.SUFFIXES)
     if found:
         return f" Found {', '.join(found[:3])}: name it with `source.cameras`"
@@ -127,7 +144,16 @@ def _hint(folder: Path) -> str:
             or colmap.find(below, None)
         ):
             return f" There is one in {below}: set `source.path` to it"
+    foreign = {path.suffix.lower(): path for path in sorted(folder.rglob("*"), reverse=True) if path.suffix.lower() in FOREIGN}
+    for suffix, what in FOREIGN.items():
+        if suffix in foreign and (suffix != ".csv" or _begins_with(foreign[suffix], b"#name")):
+            return f" {foreign[suffix].relative_to(folder)} is {what}"
     return did_you_mean_path(folder / "transforms.json")
+
+
+def _begins_with(path: Path, start: bytes) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(start)) == start
 
 
 def _instances(folder: Path, frames: tuple[Frame, ...]) -> dict[str, Path]:
