@@ -49,7 +49,7 @@ def save_dng(path, linear, mosaic=True, orientation=1, gain=None, opcodes=None, 
         (50708, 2, 0, "Planted", True),
         (50721, 10, 9, rational(CAMERA_FROM_XYZ), True),
         (50778, 3, 1, 21, True),
-        (50728, 5, 3, rational(neutral / neutral.max()), True),
+        (50728, 5, 3, rational(neutral / neutral.max() * (1.0, 0.9, 0.5)), True),  # what the camera took for white: a warm lamp
         (50714, 3, planes, (BLACK,) * planes, True),
         (50717, 4, planes, (WHITE,) * planes, True),
         (274, 3, 1, orientation, True),
@@ -116,6 +116,17 @@ def test_orientation_turns_it(tmp_path):
     np.testing.assert_array_equal(upright.pixels, images.load_photo(path).pixels.swapaxes(0, 1)[:, ::-1])
 
 
+def test_the_border_of_the_sensor_is_left_out(tmp_path):
+    """As JPEGs of the camera leave it out, by which other programs found the cameras."""
+    whole, crop = chart(), (4, 6, WIDTH - 10, HEIGHT - 8)
+    path = save_dng(tmp_path / "a.dng", whole, crop=crop)
+    assert images.header(path).size == crop[2:]
+    plain = images.load_photo(save_dng(tmp_path / "b.dng", whole)).pixels
+    np.testing.assert_array_equal(images.load_photo(path).pixels, plain[6 : 6 + crop[3], 4 : 4 + crop[2]])
+    small = save_dng(tmp_path / "c.dng", whole, crop=(4, 6, WIDTH // 2, HEIGHT // 2))  # no border
+    assert images.header(small).size == (WIDTH, HEIGHT)
+
+
 def falloff():
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     y, x = y / (HEIGHT - 1), x / (WIDTH - 1)
@@ -143,6 +154,16 @@ def test_a_gain_map_of_one_colour_touches_no_other(tmp_path):
     np.testing.assert_array_equal(one, other)
 
 
+def test_a_gain_map_lies_where_it_says():
+    """Bilinear between its points, and beyond them as at the last."""
+    gains = np.array([[1.0, 2.0, 4.0], [3.0, 5.0, 6.0]])[..., None]
+    found = raws.GainMap(slice(1, 11, 2), slice(0, 21), slice(0, 1), gains, (0.5, 0.25), (0.25, 0.1)).over(11, 21)[..., 0]
+    y, x = np.arange(11)[1:11:2] / 10, np.arange(21) / 20
+    rows = [np.interp(x, [0.1, 0.35, 0.6], row) for row in gains[..., 0]]
+    expected = [np.interp(at, [0.25, 0.75], column) for at in y for column in np.transpose(rows)]
+    np.testing.assert_allclose(found, np.reshape(expected, (5, 21)), rtol=1e-12)
+
+
 def test_a_vignette_is_the_polynomial_of_the_standard(tmp_path):
     k, centre = (0.5, 0.25, 0.125, 0.0625, 0.03125), (0.4, 0.6)
     path = save_dng(tmp_path / "a.dng", chart(), opcodes={51022: opcode_list((3, 1, struct.pack(">7d", *k, *centre)))})
@@ -159,7 +180,7 @@ def test_a_vignette_is_the_polynomial_of_the_standard(tmp_path):
 
 
 def test_distortion_that_is_left_in_is_told(tmp_path):
-    path = save_dng(tmp_path / "a.dng", chart(), opcodes={51022: opcode_list((1, 1, b"\0" * 100), (4, 1, b""))})
+    path = save_dng(tmp_path / "a.dng", chart(), opcodes={51022: opcode_list((1, 1, b"\0" * 100), (4, 0, b""))})
     assert images.load_photo(path).form == images.BENT
 
 
