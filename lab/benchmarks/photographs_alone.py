@@ -2,10 +2,10 @@
 
     python lab/benchmarks/photographs_alone.py FOLDER ROOM [ROOM ...] [--views 40] [--width 640] [--height 480] [--keep]
 
-Photographs a built-in room as cameras do (exposure, white balance, blur, noise), saves the photographs as JPEG without anything
-else, and lets the product make the scene of them (`kind: photographs`, with the height of the room) and of the same photographs
-with true cameras and mesh (`kind: folder`), up to the scores. FOLDER keeps all of it, and what is finished is not made again.
-`--keep` adds the rows to lab/notebook/data/photographs_alone.csv.
+Photographs a built-in room as people are asked to, on a walk along its walls, and as cameras do (exposure, white balance, blur,
+noise), saves the photographs as JPEG without anything else, and lets the product make the scene of them (`kind: photographs`,
+with the height of the room) and of the same photographs with true cameras and mesh (`kind: folder`), up to the scores. FOLDER
+keeps all of it, and what is finished is not made again. `--keep` adds the rows to lab/notebook/data/photographs_alone.csv.
 
 Cameras are compared after the similarity that fits their places best; the error of the metre is that of the similarity. The mesh
 is moved by it, and its error is the distance of points on it from the true surface; *complete* is the share of the true surface
@@ -20,6 +20,7 @@ import csv
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,11 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import lab  # noqa: F401  for the sources of the laboratory
+from lab import rooms
+from lab.loose import Loose, document_of
 from lab.packing import pack
+from lab.rooms.room import Room
+from lab.sources.builtin import photograph_room
 from workflow.artifacts import StageReader
 from workflow.artifacts.files import read_exr
 from workflow.scene.normal_form import CaptureReader
@@ -53,19 +58,38 @@ def make(folder: Path, *targets: str) -> None:
         raise RuntimeError(done.stderr[-2000:])
 
 
+def walk(room: Room, count: int) -> np.ndarray:
+    """Return positions and targets (count, 2, 3) of a walk around a room, looking across it, as the guide asks people to.
+
+    Cameras stand on an ellipse, as near to the walls as furniture allows, between 1 and 1.6 m high.
+    """
+    half, shots = room.size / 2, []
+    for a in 2 * np.pi * np.arange(count) / count:
+        target = half - (0.76, 0.88, 0.12) * half * (np.cos(a + 0.5), np.sin(a + 0.5), -4.8 * np.sin(2 * a + 1))
+        tall = 1.3 + 0.3 * np.sin(3 * a)
+        for share in np.arange(0.7, 0.1, -0.05):
+            eye = np.array([half[0] * (1 + share * np.cos(a)), half[1] * (1 + share * np.sin(a)), tall])
+            if room.is_free(eye):
+                break
+        shots.append((eye, target))
+    return np.array(shots)
+
+
 def photographed(folder: Path, room: str, views: int, width: int, height: int) -> Path:
     """Return the folder of the packed capture of a room, beside which the JPEGs lie in `<room>-alone`."""
     packed, alone = folder / "data" / room, folder / "data" / f"{room}-alone"
     if not (packed / "mesh.ply").is_file():
-        scene = folder / f"config/scenes/{room}.yaml"
-        scene.parent.mkdir(parents=True, exist_ok=True)
-        size = f"views: {views}, width: {width}, height: {height}"
-        effects = "{cameras: false, mesh: false, unguided: false, jpeg: false, reduced: 1}"  # the truth stays true
-        capture = f"capture: {{realism: {effects}, dynamic_range: ldr, {size}, samples: 32, denoise: true}}"
-        scene.write_text(f"source: {{kind: builtin, scene: {room}}}\n{capture}\n")
-        make(folder, f"results/{room}/capture/manifest.json")
-        pack(folder / "results" / room / "capture", packed)
-    alone.mkdir(exist_ok=True)
+        effects = {name: False for name in ("cameras", "mesh", "unguided", "jpeg")}  # the truth stays true
+        capture = {"realism": {**effects, "reduced": 1}, "dynamic_range": "ldr", "samples": 32, "denoise": True}
+        capture |= {"views": views, "width": width, "height": height}
+        loose = Loose(
+            folder / "rooms" / room, document_of({"source": {"kind": "builtin", "scene": room}, "capture": capture}), room
+        )
+        job, made = loose.job("capture", 2), rooms.build(room)
+        photograph_room(job, replace(made, shots=walk(made, views)))
+        job.writer.finish()
+        pack(folder / "rooms" / room / "capture", packed)
+    alone.mkdir(parents=True, exist_ok=True)
     for path in sorted((packed / "images").glob("*.png")):
         target = alone / f"{path.stem}.jpg"
         if not target.is_file():
@@ -179,7 +203,9 @@ def row_of(folder: Path, room: str, views: int, width: int, height: int) -> dict
     }
     for kind in KINDS:
         text = f"source: {sources[kind]}\ncapture: {{exposure: estimate}}\n"
-        (folder / f"config/scenes/{room}-{kind}.yaml").write_text(text)
+        path = folder / f"config/scenes/{room}-{kind}.yaml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
         make(folder, f"results/{room}-{kind}/metrics/manifest.json")
     results = folder / "results"
     job = json.loads((results / f"{room}-alone/benchmarks/reconstruction.parts.json").read_text())["job"]
