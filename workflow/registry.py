@@ -223,6 +223,7 @@ STAGES: dict[str, Stage] = {
             files=("workflow.report.sources", "workflow.decisions.held"),
             scores=True,
             threads=1,
+            also=(("photographs", ("reconstruction",)),),
         ),
         Stage(
             "publish",

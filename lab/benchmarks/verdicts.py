@@ -553,7 +553,7 @@ def _offset(capture: CaptureReader, room: Any, true: Callable[[Array], Array]) -
     return float(np.quantile(of_view, 0.75, method="higher"))
 
 
-FACTS = {field.name: str(field.type) for field in dataclasses.fields(Evidence)}
+FACTS = {field.name: str(field.type) for field in dataclasses.fields(Evidence) if field.name != "worst"}  # words alone
 TRUTH = ("offset", "missing", "albedo", "albedo_scaled", "level", "false_m2", "false_power", "missed_power")
 LIGHTS = ("geometry", "light", "materials", "scale")
 COLUMNS = (
@@ -631,7 +631,7 @@ def read_rows(file: Path) -> list[dict[str, Any]]:
 def _evidence_of(row: Mapping[str, str]) -> Evidence:
     values: dict[str, Any] = {}
     for name, kind in FACTS.items():
-        text = row[f"saw_{name}"]
+        text = row.get(f"saw_{name}", "")  # rows of before have not all of it
         if name == "warnings":
             values[name] = [tuple(one) for one in json.loads(text)]
         elif text or kind == "str":

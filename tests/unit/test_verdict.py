@@ -59,11 +59,30 @@ def test_a_hopeless_capture_says_so_first():
 def test_what_to_do_about_a_mesh_that_was_found_from_photographs():
     """It has no axes to set and no scan to mend."""
     poor = dataclasses.replace(GOOD, escape=0.6, edges=0.02, agreement=0.2, depth=None)
-    given, found = (judge(dataclasses.replace(poor, from_photographs=own)).lights[0] for own in (False, True))
-    remedies = {" ".join(finding.remedy for finding in light.findings) for light in (given, found)}
-    assert len(remedies) == 2 and [f.level for f in given.findings] == [f.level for f in found.findings]
-    (said,) = remedies - {" ".join(finding.remedy for finding in given.findings)}
+    given, found = (judge(dataclasses.replace(poor, confirmed=own)).lights[0] for own in (None, 0.56))
+    assert [f.level for f in given.findings] == [f.level for f in found.findings if "56 %" not in f.text]
+    said = " ".join(finding.remedy for finding in found.findings if "56 %" not in finding.text)
     assert "overview.png" in said and "source." not in said and "scan" not in said and "COLMAP" not in said
+
+
+def test_a_mesh_that_only_its_own_photographs_judge_is_never_good():
+    """What lets no light out was built, and the depth that fits is what it was made of."""
+    light = judge(dataclasses.replace(GOOD, confirmed=0.56, built=21.2)).lights[0]
+    assert light.level == AMBER and "56 %" in light.findings[0].text and "21 m²" in light.findings[0].text
+    assert not any("leave the mesh" in finding.text for finding in light.findings)
+    assert levels(dataclasses.replace(GOOD, confirmed=0.56, escape=0.6))["geometry"] == RED
+
+
+def test_lamps_that_are_more_likely_surface_light_no_room():
+    assert changed(unlikely=2)["light"] == GREEN  # one is left
+    assert changed(unlikely=3)["light"] == RED
+    assert changed(unlikely=3, environment=True)["light"] == AMBER
+    assert changed(unlikely=3, environment=True, escape=0.5)["light"] == RED
+
+
+def test_the_worst_photograph_is_named():
+    said = judge(dataclasses.replace(GOOD, worst=("IMG_004", 15.93))).lights[2]
+    assert any("IMG_004" in finding.text and "15.9" in finding.text for finding in said.findings)
 
 
 def test_nothing_that_lights_the_room():

@@ -11,8 +11,10 @@ from workflow.decisions import numerics
 from workflow.report.reported import Reported
 from workflow.report.scores import found
 from workflow.report.verdict import Evidence
-from workflow.scene.normal_form import CaptureReader
+from workflow.report.views import psnr_of_views
 
+LIKELY = 0.5
+"""Probability from which an emitter is more likely a lamp than surface."""
 NUMERICS = ("base", "emission", "shading", "affines")
 """Stages that say where their arithmetic came close to its end."""
 BRIGHT = 12.0
@@ -20,11 +22,6 @@ BRIGHT = 12.0
 lamp was 3 to 11 times as bright, window panes and lamp shades 11 to 80 times (lab/notebook/verdicts.md)."""
 SHOWN = 0.2
 """A lamp that fewer pixels show than this share of what surface of its area has on average is hardly photographed."""
-
-
-def _source_of(capture: CaptureReader) -> str:
-    """Return the kind of source that a capture was made from; "" where its manifest does not say."""
-    return capture.reader.manifest.get("settings", {}).get("source", {}).get("kind", "")
 
 
 def evidence_of(scene: Reported) -> Evidence:
@@ -43,6 +40,12 @@ def evidence_of(scene: Reported) -> Evidence:
     light, pixels = scene.readers["emission"], sum(view.width * view.height for view in capture.used)
     density = min(pixels, EmissionOptions.pixels) / max(float(recovered.surface.areas.sum()), 1e-9)
     fitted = scene.readers["affines"]
+    lamps = emitters["kept"].astype(bool) & (emitters["kind"] == "area")
+    probability = emitters.get("probability", np.full(len(lamps), -1.0))
+    alone = scene.document("reconstruction") if "reconstruction" in scene.readers else {}
+    unplaced = len(alone.get("left_out", ()))
+    scored = psnr_of_views(scene.readers["metrics"].table("metrics.parquet"))
+    worst = min(scored, key=lambda view: scored[view], default="")
     uncertainty = fitted.table("cells.parquet").get("uncertainty", ())
 
     def psnr(quantity: str) -> float | None:
@@ -56,16 +59,19 @@ def evidence_of(scene: Reported) -> Evidence:
     return Evidence(
         escape=escape.get("secondary"),
         escape_camera=escape.get("primary"),
-        depth=alignment.get("depth_median_disagreement"),
+        # The depth of photographs alone is what their mesh was made of.
+        depth=None if alone else alignment.get("depth_median_disagreement"),
         edges=alignment.get("edge_correlation"),
         edges_warn=any("may not be aligned" in str(note) for note in capture.facts.get("notes", [])),
         agreement=float(np.median(agreement)) if agreement else None,
-        from_photographs=_source_of(capture) == "photographs",
+        confirmed=float(np.mean(alone["depth_share"])) if alone else None,
+        built=sum(float(side["added_m2"]) for side in alone.get("planes", ())),
         photographs=len(capture.views),
-        lost=len(capture.facts.get("dropped_views") or ()) + len(capture.facts.get("left_out_views") or ()),
+        lost=sum(map(len, (capture.facts.get("dropped_views") or (), capture.facts.get("left_out_views") or ()))) + unplaced,
         photographed=float(cache[-1]) if cache else scene.document("plan").get("probes", {}).get("photographed_share"),
         stability=scene.document("segmentation").get("stability"),
-        lamps=int(np.count_nonzero(emitters["kept"].astype(bool) & (emitters["kind"] == "area"))),
+        lamps=int(np.count_nonzero(lamps)),
+        unlikely=int(np.count_nonzero(lamps & (probability >= 0) & (probability < LIKELY))),
         environment=bool(np.any(recovered.light.environment)),
         doubtful_area=doubtful_area(light.table("emitters.parquet"), light.table("radiance_cache.parquet"), density),
         misfit=emission.get("misfit"),
@@ -73,6 +79,7 @@ def evidence_of(scene: Reported) -> Evidence:
         held_out=psnr("rgb_held_out"),
         held_out_views=int(found(means, "rgb_held_out", "raw", "psnr").get("views", 0)),
         used=psnr("rgb"),
+        worst=(worst, scored[worst]) if worst else None,
         albedo=psnr("albedo"),
         roughness=over_all("roughness"),
         metallic=over_all("metallic"),

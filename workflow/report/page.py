@@ -111,6 +111,7 @@ class Page:
     credit: str
     verdict: Verdict
     hero: Pair
+    overview: str
     hero_note: str
     headline: str
     numbers: Sequence[Number]

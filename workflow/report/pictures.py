@@ -6,6 +6,7 @@ import base64
 import io
 from collections.abc import Sequence
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,11 @@ DEPTH_STEP = 0.05  # relative, see `depth_edges`
 _COLOUR_MAPS = {"error": "inferno", "value": "viridis"}
 SCALAR_STEPS = 128
 """Colours of a scalar map: few enough for a palette, so that the page can read values back from the colours."""
+
+
+def png_address(path: Path) -> str:
+    """Return the `data:` address of a PNG file."""
+    return f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
 def encoded(image: Array) -> Array:

@@ -115,13 +115,16 @@ class Evidence:
         depth: median disagreement of mesh and measured depth.
         edges: correlation of edges of photographs and mesh; edges_warn: whether the source found it too weak.
         agreement: median correlation of a photograph with what the others show of the same surface.
-        from_photographs: whether cameras and mesh were found from the photographs alone.
+        confirmed: share of the pixels whose depth several photographs confirm, of a mesh that was found from photographs alone;
+            built: m^2 of its sides where they show no surface.
         photographs: number of photographs; lost: how many were left out of those given.
         photographed: share of the surface met by rays from surface that photographs show.
         stability: of the objects; None also where objects are given.
-        lamps: emitters that were kept; environment: whether light from outside was found.
+        lamps: emitters that were kept; unlikely: how many of them are more likely surface that reflects.
+        environment: whether light from outside was found.
         doubtful_area: m^2 of what was taken for lamps without clear evidence (`evidence.doubtful_area`).
         misfit: of the light; light_spread: of the light against the truth.
+        worst: the photograph whose re-rendering is worst, and its PSNR.
         held_out, used: PSNR of re-renderings of photographs that were held out, and that were used.
         held_out_views: number of held-out photographs.
         albedo, roughness, metallic: PSNR against the truth, as they are; has_truth: whether there is truth.
@@ -141,12 +144,14 @@ class Evidence:
     edges: float | None = None
     edges_warn: bool = False
     agreement: float | None = None
-    from_photographs: bool = False
+    confirmed: float | None = None
+    built: float = 0.0
     photographs: int = 0
     lost: int = 0
     photographed: float | None = None
     stability: float | None = None
     lamps: int = 0
+    unlikely: int = 0
     environment: bool = False
     doubtful_area: float | None = None
     misfit: float | None = None
@@ -154,6 +159,7 @@ class Evidence:
     held_out: float | None = None
     held_out_views: int = 0
     used: float | None = None
+    worst: tuple[str, float] | None = None
     albedo: float | None = None
     roughness: float | None = None
     metallic: float | None = None
@@ -340,24 +346,37 @@ def _geometry(e: Evidence) -> Light:
         level = max(LIMITS["edges"].level(e.edges), AMBER if e.edges_warn else GREEN, key=ORDER.index)
         remedy = (
             FROM_PHOTOGRAPHS
-            if e.from_photographs
+            if e.confirmed is not None
             else "Look at the pictures 'alignment'; check source.axes, source.unit, and that each photograph has its own pose"
         )
         # Measured depth is stronger evidence than edges, which a room without texture hardly has.
         level = min(level, AMBER, key=ORDER.index) if e.depth is not None else level
         edges = Finding(level, f"Edges of photographs and mesh correlate by {e.edges:.2f}", "" if level == GREEN else remedy)
     camera = "" if e.escape_camera is None else f", and {percent(e.escape_camera, 1)} of those from the cameras"
+    alone = None
+    if e.confirmed is not None:  # nothing but the photographs judges this mesh, and they made it
+        alone = Finding(
+            AMBER,
+            f"Cameras and mesh were found from the photographs alone: several confirm the depth of {percent(e.confirmed)} of"
+            f" their pixels, and {e.built:.0f} m² of flat sides were built where they show none",
+            "Look at the picture of cameras and mesh below, and at room.html from above: furniture without texture has holes."
+            " Take more photographs of what is torn, or use the mesh of a scan (docs/guide/programs.md)",
+        )  # fmt: skip
+    escape = _finding(
+        "escape", e.escape, f"{{}} of the rays from surfaces leave the mesh{camera}",
+        "Photograph the walls, floor and ceiling that are missing, each from three places, and add them"
+        if e.confirmed is not None else
+        "Close the mesh: scan the walls, floor and ceiling that it lacks, because they reflect light and keep light out."
+        " Sides made up by source.close help less than they cost in most rooms (docs/guide/own-data.md)", ".1%",
+    )  # fmt: skip
+    if alone and escape and escape.level == GREEN:  # the sides that were built let nothing out
+        escape = None
     return _made(
         "geometry",
         "Does the mesh hold the room, and do the photographs lie on it?",
         [
-            _finding(
-                "escape", e.escape, f"{{}} of the rays from surfaces leave the mesh{camera}",
-                "Photograph the walls, floor and ceiling that are missing, each from three places, and add them"
-                if e.from_photographs else
-                "Close the mesh: scan the walls, floor and ceiling that it lacks, because they reflect light and keep light out"
-                " (docs/guide/own-data.md)", ".1%",
-            ),
+            alone,
+            escape,
             _finding(
                 "depth", e.depth, "Mesh and measured depth differ by {} (median)",
                 "Check unit, axes and frame of the mesh (source.unit, source.axes)", ".1%",
@@ -365,7 +384,7 @@ def _geometry(e: Evidence) -> Light:
             edges,
             _finding(
                 "agreement", e.agreement, "Photographs of the same surface correlate by {} (median)",
-                FROM_PHOTOGRAPHS if e.from_photographs else
+                FROM_PHOTOGRAPHS if alone else
                 "Refine the poses where they were made (COLMAP, the phone's app); source.registration mends a few pixels",
                 ".2f",
             ),
@@ -384,19 +403,23 @@ def _geometry(e: Evidence) -> Light:
 
 def _light(e: Evidence) -> Light:
     outside = "light from outside the mesh" if e.environment else ""
-    if e.lamps:
-        lamps = Finding(GREEN, f"{e.lamps} {'lamp' if e.lamps == 1 else 'lamps'} found{' and ' + outside if outside else ''}")
+    counted = f"{e.lamps} {'lamp' if e.lamps == 1 else 'lamps'} found"
+    if e.lamps == e.unlikely > 0:
+        counted += ", each more likely bright surface"
+    if e.lamps > e.unlikely:
+        lamps = Finding(GREEN, f"{counted}{' and ' + outside if outside else ''}")
     elif e.environment and e.escape is not None and LIMITS["escape"].level(e.escape) == GREEN:
-        lamps = Finding(GREEN, f"0 lamps found; {outside} lights the room")
+        doubt = Finding(AMBER, counted, "Look at the list of lamps below, and photograph each lamp and window from several sides")
+        lamps = doubt if e.lamps else Finding(GREEN, f"{counted}; {outside} lights the room")
     elif e.environment:
         lamps = Finding(
             LIMITS["escape"].level(e.escape) if e.escape is not None else AMBER,
-            f"0 lamps found; what shines through the holes of the mesh ({outside}) stands for them",
+            f"{counted}; what shines through the holes of the mesh ({outside}) stands for them",
             "Photograph every lamp and window, and close the mesh around them",
         )  # fmt: skip
     else:
         lamps = Finding(
-            RED, "0 lamps found and no light from outside: nothing lights the room",
+            RED, f"{counted} and no light from outside: nothing{' else' if e.lamps else ''} lights the room",
             "Photograph a lamp or the window, and keep its surface in the mesh",
         )  # fmt: skip
     return _made(
@@ -426,14 +449,16 @@ _WORST_VIEWS = (
 
 
 def _materials(e: Evidence) -> Light:
+    worst = "" if e.worst is None else f"; of all, {e.worst[0]} is worst with {e.worst[1]:.1f}"
     if e.held_out is not None:
+        held = _counted(e.held_out_views, "held-out photograph")
         scored = _finding(
-            "rerendering", e.held_out, f"Re-renderings reach {{}} dB PSNR on {_counted(e.held_out_views, 'held-out photograph')}",
+            "rerendering", e.held_out, f"Re-renderings reach {{}} dB PSNR on {held}{worst}",
             _WORST_VIEWS, ".1f",
         )  # fmt: skip
     else:
         scored = _finding(
-            "rerendering", e.used, "Re-renderings reach {} dB PSNR on the photographs",
+            "rerendering", e.used, f"Re-renderings reach {{}} dB PSNR on the photographs{worst}",
             _WORST_VIEWS, ".1f",
         )  # fmt: skip
     judged = None

@@ -10,6 +10,7 @@ from workflow.decisions import expected, numerics
 from workflow.decisions.record import plan_text
 from workflow.decisions.settled import settled_plan
 from workflow.exporters.object_table import read_csv
+from workflow.report import pictures as pic
 from workflow.report import scores, views
 from workflow.report.deliverable import published_names
 from workflow.report.downloads import commands, downloads
@@ -34,7 +35,7 @@ from workflow.settings import active_plan
 
 def run(job: Job) -> None:
     """Write report.html, verdict.json and plan.yaml."""
-    readers = {stage: job.read(stage) for stage in job.stage.upstream}
+    readers = {stage: job.read(stage) for stage in job.stage.reads(job.document)}
     capture, recovered, export = CaptureReader(readers["capture"]), read_recovered(job), readers["export"]
     summary, objects = readers["metrics"].json("summary.json"), read_csv(export.path("objects.csv").read_bytes())
     scene = Reported(readers | {"base": read_base(job)}, capture, recovered, summary, objects)
@@ -65,6 +66,7 @@ def run(job: Job) -> None:
         warnings=numerics.warnings([(stage, scene.document(stage)) for stage in NUMERICS]),
         plan=[{**item, "reason": reason_words(item["component"], str(item.get("reason", "")))} for item in plan],
         tables=scores.score_tables(summary),
+        overview=pic.png_address(found.path("overview.png")) if (found := readers.get("reconstruction")) else "",
         pairs=[views.pair(scene, view, psnr, views.PAIR_WIDTH) for view in views.spread(ranked, views.PAIRS)],
         pairs_note=views.pairs_note(len(ranked), summary["views"]),
         views=_drawn(job, scene, views.spread(ranked, job.settings.report.views), psnr),
