@@ -110,7 +110,8 @@ def reference_markdown() -> str:
             lines.extend([f"### `{name}`{what}", "", " ".join((section.__doc__ or "").split()), ""])
             rows(section, f"{name}{many}.")
         else:
-            lines.extend([f"### `{name}`", "", f"Default `{field.get_default()}`. {field.description or ''}", ""])
+            default = field.get_default(call_default_factory=True)
+            lines.extend([f"### `{name}`", "", f"Default `{default}`. {field.description or ''}", ""])
 
     advanced = {name: title for title, (_, names) in PARTS.items() for name in names}
     for title, (about, _) in {FIRST: ("What only you know, or choose.", ()), **PARTS}.items():

@@ -45,9 +45,21 @@ def test_what_is_read_decides_where_specular_light_is_traced_and_how_noisy_diffu
     assert (shading["pixels"], shading["noise"]) == (pixels, noise)
 
 
-def test_a_decimal_comma_is_told(scene):
-    with refused("config/scenes/x.yaml", "source.room_height", "'2,6'", "2.6"):
-        settings.load("x", "draft", scene("source: {kind: photographs, path: a, room_height: '2,6'}\n"))
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("source: {kind: photographs, path: a, room_height: '2,6'}", ["source.room_height", "'2,6'", "2.6"]),
+        ("source: {kind: photographs, path: a, room_height: 2,6}", ["2.6", "line 1"]),  # two entries to YAML
+        ("source:\n  kind: photographs\n  path: a\n  room_height: 2,6", ["source.room_height", "'2,6'", "2.6"]),
+        ("source: {kind: photographs, path: a, room_height: 2.6 m}", ["source.room_height", "'2.6 m'", "2.6"]),
+        ("source: {kind: photographs, path: a, room_height: 260}", ["source.room_height", 260, "metres"]),
+        ("source: {kind: folder, path: a, room_height: 2.6}", ["source.room_height", "`kind: photographs`"]),
+        ("source: {kind: folder, path: a}\ncapture: {exposure: auto}", ["capture.exposure", "'auto'", "'estimate'"]),
+    ],
+)
+def test_what_people_write_is_told_in_the_form_that_works(scene, text, names):
+    with refused("config/scenes/x.yaml", *names):
+        settings.load("x", "draft", scene(f"{text}\n"))
 
 
 def test_noise_of_the_light_can_be_set(scene):

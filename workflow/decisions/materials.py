@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from workflow.decisions.record import FORCED, Decision, decision
@@ -31,11 +33,22 @@ def given_words(objects: int, given: np.ndarray | None) -> list[str]:
     return [", ".join(name for name, told in zip(("roughness", "metallic"), row, strict=True) if told) for row in known]
 
 
+_BY_HAND = "given by hand, not fitted: "
+
+
+def by_shown_names(item: Decision, shown: Mapping[str, str]) -> Decision:
+    """Return a decision of `given_by_hand` with the names that people see (the segmentation's -> theirs); others as they are."""
+    if item["component"] != "given_materials" or not str(item.get("reason", "")).startswith(_BY_HAND):
+        return item
+    told = [one.rpartition(" (") for one in item["reason"].removeprefix(_BY_HAND).split("; ")]
+    return {**item, "reason": _BY_HAND + "; ".join(f"{shown.get(name, name)} ({what}" for name, _, what in told)}
+
+
 def given_by_hand(names: list[str], given: np.ndarray) -> Decision:
     """Describe which materials were given by hand (`materials`) and thus not fitted."""
     words = given_words(len(names), given)
     told = [f"{name} ({what})" for name, what in zip(names, words, strict=True) if what]
-    reason = f"given by hand, not fitted: {'; '.join(told)}"
+    reason = f"{_BY_HAND}{'; '.join(told)}"
     return decision("given_materials", True, "objects with values given by hand", len(told), 0.0, reason, FORCED)
 
 

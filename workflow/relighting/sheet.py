@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +15,8 @@ Array = np.ndarray
 GAP, TITLE, CAPTION, HEAD, LARGEST, LEAST_WIDTH = 6, 20, 18, 34, 384, 320
 """Pixels between pictures, of a line of a title, of a caption, of a line of the title of the sheet, of the longer side of a
 picture, and of a relighting at least."""
+AS_FOUND = "as found"
+"""What is said of a relighting that changes nothing."""
 PAIRS = 3
 """Frames of a flight that are shown."""
 
@@ -117,8 +120,8 @@ def _wrapped(text: str, font: Any, width: int, ruler: Any) -> list[str]:
     return lines
 
 
-def described(entry: dict[str, Any], default: str = "as found") -> str:
-    """Describe what a dumped relighting changes, for captions."""
+def described(entry: dict[str, Any], names: Mapping[str, str] | None = None) -> str:
+    """Describe what a dumped relighting changes, for captions; `names`: the setting."""
     parts = []
     if entry["emitters"] != 1:
         parts.append(f"{'all' if not entry['lamps'] else 'other'} lamps {_factor(entry['emitters'])}")
@@ -135,8 +138,8 @@ def described(entry: dict[str, Any], default: str = "as found") -> str:
     if entry["sphere"]:
         parts.append("a luminous sphere" + (" that moves" if entry["sphere"]["path_to"] else ""))
     parts += [f"{name_of(insert)} put in" for insert in entry["insert"]]
-    parts += [f"{key} painted" for key in entry["materials"]]
-    return "; ".join(parts) or default
+    parts += [f"{name} painted" for name in dict.fromkeys((names or {}).get(key, key) for key in entry["materials"])]
+    return "; ".join(parts) or AS_FOUND
 
 
 def _factor(value: float | str) -> str:

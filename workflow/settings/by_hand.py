@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
@@ -66,31 +65,32 @@ ByObject = Annotated[dict[str, GivenMaterial], TEXT_KEYS]
 LONGEST_NAME = 60
 
 
-def _told_apart(names: dict[str, str]) -> dict[str, str]:
+def _readable(names: dict[str, str]) -> dict[str, str]:
     for key, name in names.items():
         if not name.isprintable() or name != name.strip() or not 0 < len(name) <= LONGEST_NAME or re.fullmatch(r"[\d/.]+", name):
             raise ValueError(
                 f"the name of {key!r}, {name!r:.80}, must have 1 to {LONGEST_NAME} printable characters, no blanks around it,"
                 " and be no number"
             )
-    twice = sorted(name for name, count in Counter(names.values()).items() if count > 1)
-    if twice:
-        raise ValueError(f"{twice[0]!r} is given to several objects; number them, such as {twice[0]!r} and {twice[0] + ' 2'!r}")
     return names
 
 
-Names = Annotated[dict[str, str], TEXT_KEYS, AfterValidator(_told_apart)]
+Names = Annotated[dict[str, str], TEXT_KEYS, AfterValidator(_readable)]
 
 
 def by_former_names(named: dict[str, Any], names: dict[str, str]) -> dict[str, Any]:
-    """Return a mapping of objects with the key of `names`, by which the segmentation knows an object, in the place of its name.
+    """Return a mapping of objects with the keys of `names`, by which the segmentation knows objects, in the place of their name.
 
-    >>> by_former_names({"sofa": 1, "table": 2}, {"24": "sofa"})
-    {'24': 1, 'table': 2}
+    >>> by_former_names({"sofa": 1, "table": 2}, {"24": "sofa", "25": "sofa"})
+    {'24': 1, '25': 1, 'table': 2}
+
+    Raises:
+        ValueError: an object is there by both names.
     """
-    former = {name: key for key, name in names.items()}
-    out = {former.get(key, key): value for key, value in named.items()}
-    if len(out) < len(named):
-        twice = next(key for key in named if key in former and former[key] in named)
-        raise ValueError(f"{twice!r} and {former[twice]!r} are one object (`names`); write one of them")
+    out: dict[str, Any] = {}
+    for key, value in named.items():
+        for former in [own for own, name in names.items() if name == key] or [key]:
+            if former in out:
+                raise ValueError(f"{names.get(former, key)!r} and {former!r} are one object (`names`); write one of them")
+            out[former] = value
     return out

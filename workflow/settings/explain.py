@@ -36,6 +36,10 @@ NEEDED = {
 """What a value of the wrong type should have been, by the type of pydantic's error."""
 BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 """Words for the limits of a number, by their names in pydantic's errors."""
+IN_METRES = ("source.room_height", "source.camera_height")
+"""Lengths that people give in other units."""
+MEANT = {"capture.exposure": dict.fromkeys(("auto", "automatic"), "estimate"), "source.unit": {"meter": "m", "metre": "m"}}
+"""Words that people try -> what they mean."""
 EXAMPLES = {"relight": "config/relight/kitchen.yaml"}
 """Files that show all of a section that config/scenes/kitchen.yaml does not have."""
 RENAMED = {
@@ -110,6 +114,12 @@ def _one_of_each_choice(problems: Sequence[Any]) -> list[Any]:
     return kept
 
 
+def _of_another_kind(where: tuple[str | int, ...]) -> str:
+    """Say to which other `kind` of a section a key belongs."""
+    kinds = [kind for kind, section in UNIONS.get(str(where[0]), {}).items() if where[-1] in section.model_fields]
+    return f" It belongs to `kind: {kinds[0]}`." if kinds else ""
+
+
 def _is_section(found: Any) -> bool:
     """Return whether a value is a mapping or a list of mappings, too long to be shown."""
     return isinstance(found, dict) or (isinstance(found, list) and any(isinstance(entry, dict) for entry in found))
@@ -149,7 +159,7 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
             section = _section_of(where)
             allowed = sorted(section.model_fields) if section else []
             hint = NOT_READ.get(dotted) or did_you_mean(where[-1], allowed, "`{}`")
-            hint = f" It is `{RENAMED[dotted]}` now." if dotted in RENAMED else hint
+            hint = f" It is `{RENAMED[dotted]}` now." if dotted in RENAMED else hint or _of_another_kind(where)
             lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
         elif kind in ("model_type", "model_attributes_type", "dict_type"):
             lines.append(
@@ -173,9 +183,13 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
                 what = f'Needed: text; YAML reads it as a number, so write it in quotes, such as "{found:03}"'
             elif kind == "string_pattern_mismatch" and where[-1] == "name":
                 what = "Needed: letters, digits, _ and -, beginning with a letter or a digit"
-            elif kind == "float_parsing" and re.fullmatch(r"-?\d+,\d+", str(found)):
-                what += f", with a point: {str(found).replace(',', '.')}"
+            elif kind == "float_parsing" and (number := re.fullmatch(r"(-?\d+)(?:[.,](\d+))?\s*[a-zA-Z]*", str(found).strip())):
+                what += f" with a point, without a unit: {number[1]}.{number[2] or 0}"
+            elif dotted in IN_METRES:
+                what += " (metres)"
+            other = MEANT.get(dotted, {}).get(found) if isinstance(found, str) else None
             hint = did_you_mean(found, re.findall(r"'([^']*)'", what)) if isinstance(found, str) else ""
+            hint = f" Did you mean '{other}'?" if other else hint
             lines.append(f"{path}: `{dotted}`: found {said}. {what}.{hint}")
     if len(problems) > SHOWN:
         lines.append(f"... and {len(problems) - SHOWN} more")

@@ -98,7 +98,9 @@ class SceneSettings(Section):
         object.__setattr__(self, "relight", entries)
         patch = getattr(self.affines.scale, "white_patch", None)
         if patch is not None and patch.object is not None:
-            (known,) = by_former_names({patch.object: None}, self.names)
+            known, *others = by_former_names({patch.object: None}, self.names)
+            if others:
+                raise ValueError(f"affines.scale.white_patch.object: {patch.object!r} is the name of several objects; give an id")
             scale = self.affines.scale.model_copy(update={"white_patch": patch.model_copy(update={"object": known})})
             object.__setattr__(self, "affines", self.affines.model_copy(update={"scale": scale}))
         return self

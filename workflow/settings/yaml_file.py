@@ -22,7 +22,12 @@ class _Strict:
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[Any] = set()
-        for key_node, _ in node.value:
+        before = ""
+        for key_node, value_node in node.value:
+            # `{a: 2,6}` is `{a: 2, 6: null}`.
+            if node.flow_style and before.isdigit() and key_node.value.isdigit() and not value_node.value:
+                raise _fault(f"a comma in a number? Write {before}.{key_node.value} with a point", key_node.start_mark)
+            before = value_node.value if isinstance(value_node, yaml.ScalarNode) else ""
             if key_node.tag == "tag:yaml.org,2002:merge":
                 raise _fault("`<<` is not read; write the keys themselves", key_node.start_mark)
             key = self.construct_object(key_node, deep=deep)  # type: ignore[attr-defined]

@@ -20,6 +20,7 @@ from workflow.relighting.tracing import Studio
 from workflow.relighting.video import encoded
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_gains
+from workflow.scene.named import new_names
 from workflow.scene.recovered import read_response
 from workflow.settings import require_relighting
 
@@ -62,7 +63,7 @@ def _relight(one: Frames, curve: Response) -> tuple[dict[str, Any], sheet.Row]:
     before = {frame: one.picture_before(frame) for frame in shown}
     taken = photograph_exposure(one.studio.capture, read_gains(job), view)
     display = display_of(entry, curve, taken, view.name, before[shown[0]], lambda: one.picture(0))
-    pairs, is_dark = [], True
+    changes, pairs, is_dark = sheet.described(entry, new_names(job)), [], True
 
     def pictures() -> Iterator[Array]:
         nonlocal is_dark
@@ -86,7 +87,7 @@ def _relight(one: Frames, curve: Response) -> tuple[dict[str, Any], sheet.Row]:
     job.progress(len(one), len(one), f"frames of {name}")
     facts = {
         "name": name,
-        "changes": sheet.described(entry),
+        "changes": changes,
         "frames": len(one),
         "method": "recombined" if one.basis else "path traced",
         **display.facts(),
@@ -95,7 +96,11 @@ def _relight(one: Frames, curve: Response) -> tuple[dict[str, Any], sheet.Row]:
     if is_dark:
         facts["note"] = "black: no light is on, or none reaches the room"
         job.log.warning("relighting %s is %s", name, facts["note"])
-    return facts, sheet.Row(f"{name}: {sheet.described(entry)} (exposure {display.source})", pairs)
+    elif changes != sheet.AS_FOUND and all(np.array_equal(pair.before, pair.after) for pair in pairs):
+        facts["note"] = "as before: no lamp or surface that it names makes a difference to this picture"
+        job.log.warning("relighting %s is %s", name, facts["note"])
+        changes += ", which changes nothing"
+    return facts, sheet.Row(f"{name}: {changes} (exposure {display.source})", pairs)
 
 
 def _write(job: Job, name: str, radiance: Array, picture: Array) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from workflow.decisions import expected, numerics
+from workflow.decisions.materials import by_shown_names
 from workflow.decisions.record import plan_text
 from workflow.decisions.settled import settled_plan
 from workflow.exporters.object_table import read_csv
@@ -28,6 +29,7 @@ from workflow.runtime import forecast
 from workflow.runtime.job import Job
 from workflow.runtime.timings import read_timings
 from workflow.scene.base_scene import read_base
+from workflow.scene.named import object_names
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import read_recovered
 from workflow.settings import active_plan
@@ -41,6 +43,8 @@ def run(job: Job) -> None:
     scene = Reported(readers | {"base": read_base(job)}, capture, recovered, summary, objects)
     cost = forecast.together(expected.STAGES, job.scene, job.quality)
     plan = [expected.with_expectation(item, cost) for item in settled_plan(readers)]
+    former = object_names(readers["segmentation"], len(recovered.object_names))
+    plan = [by_shown_names(item, dict(zip(former, recovered.object_names, strict=True))) for item in plan]
     job.writer.bytes("plan.yaml", plan_text(job.scene, job.quality, plan).encode())
     verdict = judge(evidence_of(scene))
     job.writer.json("verdict.json", verdict.document())
