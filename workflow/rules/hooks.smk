@@ -69,12 +69,18 @@ def tell_results():
         return
     for line in choose.reached(REQUEST, CHOSEN):
         print(line, file=sys.stderr)
-    made = [path.parent for path in Path("scenes").glob("*/manifest.json") if path.stat().st_mtime >= STARTED]
+    # Of this run alone: other runs may have published in the same folder meanwhile.
+    asked = {(job.rule.name, job.wildcards.scene) for job in workflow.dag.jobs if "scene" in job.wildcards.keys()}
+    made = [path.parent for path in Path("scenes").glob("*/manifest.json") if ("publish", path.parent.name) in asked]
+    made = [folder for folder in made if (folder / "manifest.json").stat().st_mtime >= STARTED]
     pages = [folder / page for folder in sorted(made) for page in ("report.html", "room.html")]
+    found_cameras = sorted(Path("results").glob("*/reconstruction/overview.png"))
+    pages += [path for path in found_cameras if ("reconstruction", path.parts[1]) in asked and path.stat().st_mtime >= STARTED]
     if batch_asked:
         pages = [Path("results/batch/report.html")]
-    sheets = sorted(Path("relight").glob("**/contact_sheet.png"))
-    pages += [path for path in sheets if path.stat().st_mtime >= STARTED]
+    sheets = [path for path in sorted(Path("relight").glob("**/contact_sheet.png")) if path.stat().st_mtime >= STARTED]
+    relit = {scene for rule, scene in asked if rule in ("relit", "relit_plan")}
+    pages += [path for path in sheets if path.parts[1] in relit]
     found = [str(page.resolve()) for page in pages if page.is_file()]
     if found:
         atexit.register(print, "\nOpen: " + "\n      ".join(found), file=sys.stderr)

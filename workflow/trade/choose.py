@@ -185,7 +185,11 @@ def told(request: Request, chosen: Mapping[str, Choice]) -> list[str]:
         return [choice.line for choice in chosen.values() if choice.line]
     scenes = {scene: overridden(scene, request.quality) for scene in chosen if not derived.derived(scene)}
     own = [f"{scene_origin(scene)} sets {', '.join(changed)} itself" for scene, changed in scenes.items() if changed]
-    return [_expectation(request.quality, point), *own[:5], *([f"and {len(own) - 5} more scenes do"] if len(own) > 5 else [])]
+    return [
+        _expectation(request.quality, point, chosen),
+        *own[:5],
+        *([f"and {len(own) - 5} more scenes do"] if len(own) > 5 else []),
+    ]
 
 
 def reached(request: Request, scenes: Iterable[str]) -> list[str]:
@@ -229,7 +233,7 @@ def _in_time(request: Request, scene: str) -> Choice:
             f" {_about(scene, cheapest, costs[cheapest])}. Ask for more, or run it with --config quality={cheapest}"
         )
     name = max(kept, key=lambda name: (points()[name].expected("albedo").mean, -costs[name].seconds.middle))
-    line = f"{scene}, {request.value}: {_about(scene, name, costs[name])}; {_expectation(name, points()[name])}"
+    line = f"{scene}, {request.value}: {_about(scene, name, costs[name])}; {_expectation(name, points()[name], [scene])}"
     return Choice(canonical(name), line)
 
 
@@ -284,10 +288,16 @@ def _about(scene: str, name: str, cost: forecast.Wall) -> str:
     return f"quality {named}, about {cost.seconds.middle:.0f} s ({forecast.span(cost.seconds)}){cost.beside}{over}"
 
 
-def _expectation(quality: str, point: Point) -> str:
+def _expectation(quality: str, point: Point, scenes: Iterable[str]) -> str:
+    """Return what a quality is, and the scores that were measured of it where the scenes are like those that were measured."""
+    what, kinds = f"quality {quality}, {photographs(quality)}", set()
+    for scene in scenes:
+        kinds.add(json.loads(fingerprints.resolved(scene, quality)).get("prior", {}).get("kind"))
+    if kinds != {"simulated"}:
+        return f"{what}; how accurate the result of photographs is: docs/guide/accuracy.md"
     parts = []
     for score in SCORES:
         expected = point.expected(score)
         words = "held-out photographs, re-rendered" if score == "held_out" else f"{score} up to scale"
         parts.append(f"{words} {expected.mean:.1f} dB ({expected.low:.1f} to {expected.high:.1f})")
-    return f"quality {quality}, {photographs(quality)}: PSNR in {len(point.rooms)} rooms {LABORATORY}: {', '.join(parts)}"
+    return f"{what}: PSNR in {len(point.rooms)} rooms {LABORATORY}: {', '.join(parts)}"
