@@ -32,6 +32,9 @@ OVERLAP = 0.2
 """How far (m) they overlap."""
 CLOSES = 0.5
 """Share of the sides that must be planes for those at the extent to be built: they close a room, and do not make one up."""
+LAYER, ANGLE, MOST_FACES = 0.03, 0.25, 50_000
+"""Thickness (m) of the layers by which the direction of the walls is told, steps (degrees) in which it is looked for, and faces
+that are counted."""
 THROUGH = 0.05
 """Share by which a depth map must look beyond a tile to say that nothing is there."""
 BEYOND = 0.05
@@ -69,7 +72,8 @@ def flat_walls(
 ) -> tuple[Walls, NDArray]:
     """Return the planes around a room, and (m,) bool: the faces of its mesh whose place they take.
 
-    The planes are those of `enclosure`. A square of a plane is built unless depth maps show something behind it, as through a
+    The planes are those of `enclosure`; along the axes of the room a little surface is enough, such as a picture or a door on a
+    wall without texture. A square of a plane is built unless depth maps show something behind it, as through a
     door. Where a plane prolongs surface of the mesh, it takes the place of the surface that lies on it. Planes at the extent
     close what is left, if at least half of the sides are planes: there squares are built where no surface is near, and go on a
     little behind the surface at their border.
@@ -81,8 +85,9 @@ def flat_walls(
         points: (p, 3) that photographs show: where no plane is, sides go at least as far as most of the outermost ones.
     """
     centres = np.array([picture.centre for picture in pictures])
-    sides = enclosure(vertices, faces, centres, "planes", margin=0.0, beyond=BEYOND, noise=NOISE, shown=points)
     normal, area = face_geometry(vertices, faces)
+    square = room_axes(vertices[faces].mean(1), normal, area)
+    sides = enclosure(vertices, faces, centres, "planes", margin=0.0, beyond=BEYOND, noise=NOISE, shown=points, square=square)
     sides, error = _placed(sides, vertices[faces].mean(1), normal, area)
     is_plane = np.isfinite(error)
     corners, quads, side = _squares(sides)
@@ -116,6 +121,31 @@ def flat_walls(
     local = local.reshape(-1, 4)
     both = np.concatenate([local[:, [0, 1, 2]], local[:, [0, 2, 3]]])
     return Walls(placed, both, np.tile(side, 2), np.tile(found, 2), sides, error), flat
+
+
+def room_axes(middle: NDArray, normal: NDArray, area: NDArray) -> NDArray:
+    """Return axes (3, 3) of a room with z up: x and y along the walls, where upright surface lies in the thinnest layers,
+
+    argmax over phi of sum_b h_b(phi)^2 + sum_b h'_b(phi)^2 (docs/method/reconstruction.md, Eq. D.4),
+
+    with the area h_b, h'_b in layers of `LAYER` along both axes. Normals alone are off by degrees on noisy surface.
+
+    Args:
+        middle, normal: (m, 3) of the faces, metres; area: (m,).
+    """
+    upright = np.flatnonzero(np.abs(normal[:, 2]) < np.sqrt(1 - ALONG**2))
+    upright = upright[:: max(1, len(upright) // MOST_FACES)]
+    place, weight = middle[upright, :2] - middle[upright, :2].mean(0), area[upright]
+    angles = np.radians(np.arange(-45, 45, ANGLE))
+
+    def layers(along: NDArray) -> float:
+        number = np.rint(along / LAYER).astype(np.int64)
+        return float(np.square(np.bincount(number - number.min(), weight)).sum())
+
+    axes = np.stack([np.cos(angles), np.sin(angles)], 1)
+    packed = [layers(place @ (x, y)) + layers(place @ (-y, x)) for x, y in axes] if len(upright) else [0.0]
+    x, y = axes[int(np.argmax(packed))] if len(upright) else (1.0, 0.0)
+    return np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _placed(sides: Enclosure, middle: NDArray, normal: NDArray, area: NDArray) -> tuple[Enclosure, NDArray]:

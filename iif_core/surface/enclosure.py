@@ -20,6 +20,10 @@ BEYOND = 0.01
 """Largest share of the area that may lie behind a plane that bounds the room: what was scanned through a window."""
 SHOWN = 0.01
 """Least share of points in a layer that tells how far a room reaches."""
+SQUARE = 0.004
+"""Least share of the area that makes a plane along a given axis, of which only the place is to be found."""
+THIN = 0.05
+"""Thickness (m) of the layers in which it is looked for."""
 _BINS = 32  # of normals, along each axis
 _SHIFTS, _FITS = 8, 6
 _DIRECTIONS = 24  # of planes that are looked at, the largest first
@@ -51,6 +55,7 @@ def enclosure(
     beyond: float = BEYOND,
     noise: float = 0.0,
     shown: ArrayLike | None = None,
+    square: ArrayLike | None = None,
 ) -> Enclosure:
     """Build the closed surface around a scan.
 
@@ -66,6 +71,8 @@ def enclosure(
         noise: share of the area that is left out at each end of the extent; 0 = the extent of all vertices.
         shown: (p, 3) further points of surface, of which some may be far off; sides at the extent lie no nearer than the
             outermost layer that holds one in a hundred of them.
+        square: (3, 3) axes of a room, unit and at right angles: where no large plane bounds it along one of them, a smaller one
+            does (`SQUARE`).
 
     Returns:
         The surface. It contains all points, and the scan but for what lies behind its planes and for noise.
@@ -83,6 +90,11 @@ def enclosure(
         signed = [sign * direction for direction in axes_found for sign in (1.0, -1.0)]
         planes = [_bounding(n, middle, normal, area, within, beyond) for n in signed]
         found = np.array([plane for plane in planes if plane is not None]).reshape(-1, 4)
+        if square is not None:
+            both = np.concatenate([np.asarray(square, np.float64), -np.asarray(square, np.float64)])
+            lacking = [n for n in both if (found[:, :3] @ n < ALIKE).all()]
+            planes = [_along_axis(n, middle, normal, area, within, beyond) for n in lacking]
+            found = np.concatenate([found, np.array([plane for plane in planes if plane is not None]).reshape(-1, 4)])
         axes_found = np.concatenate([found[:, :3], axes_found])  # a plane tells its direction better than normals do
 
     # -------- sides along the axes of the room where there is none, at the extent of everything --------
@@ -215,6 +227,25 @@ def _bounding(
         at = float((middle[of_plane] @ better).max())
         if at >= (within @ better).max():
             return np.append(better, at)
+    return None
+
+
+def _along_axis(
+    outward: NDArray, middle: NDArray, normal: NDArray, area: NDArray, within: NDArray, beyond: float
+) -> NDArray | None:
+    """Return the outermost plane (4,) square to a direction, where its surface lies in the mean; None = there is none. Arguments
+    are those of `_bounding`."""
+    place, faces_it = middle @ outward, np.abs(normal @ outward) >= ALIKE
+    layer = ((place - place.min()) / THIN).astype(np.int64)
+    own, every = np.bincount(layer, area * faces_it, layer.max() + 2), np.bincount(layer, area, layer.max() + 2)
+    behind = np.append(np.cumsum(every[::-1])[::-1], 0.0)
+    two = own[:-1] + own[1:]
+    fits = (two >= SQUARE * area.sum()) & (behind[2 : len(two) + 2] <= beyond * area.sum())
+    for k in np.flatnonzero(fits)[::-1]:
+        own_faces = faces_it & (layer >= k) & (layer <= k + 1)
+        at = float(np.average(place[own_faces], weights=area[own_faces]))
+        if at >= (within @ outward).max():
+            return np.append(outward, at)
     return None
 
 
