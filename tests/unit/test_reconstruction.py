@@ -229,6 +229,30 @@ def test_walls_at_the_extent_close_a_room_behind_what_is_there():
     assert (np.abs(ends[(np.abs(ends[:, 1]) < 0.5), 0] - place) < 1e-6).all()
 
 
+@pytest.mark.parametrize("angle", [0.0, 17.0, -33.0])
+def test_a_wall_without_texture_is_found_by_what_hangs_on_it(angle):
+    """All that is found of four walls and the ceiling are pieces of 60 cm, less than 2 % of the surface each."""
+    vertices, faces = fine(*room())
+    middle = vertices[faces].mean(1)
+    side = np.abs(np.abs(middle) - [2.5, 2.0, 1.25]).argmin(1)
+    beside = np.delete(np.arange(3)[None].repeat(len(faces), 0), np.arange(len(faces)) * 3 + side).reshape(-1, 2)
+    hangs = (np.abs(np.take_along_axis(middle, beside, 1) - [0.4, 0.3]) < 0.3).all(1)
+    faces = faces[hangs | (middle[:, 2] < -1.24)]
+    rng = np.random.default_rng(0)
+    board = np.array([[-0.8, -0.2, -1.2], [-0.2, 0.4, -1.2], [-0.2, 0.4, -0.7], [-0.8, -0.2, -0.7]])  # at 45 degrees to the walls
+    found = np.concatenate([vertices + rng.normal(0, 0.001, vertices.shape), board])
+    every = np.concatenate([faces, np.array([[0, 1, 2], [0, 2, 3]]) + len(vertices)])
+    turn = Rotation.from_euler("z", angle, degrees=True).as_matrix()
+    picture = Picture(np.zeros((4, 4), np.float32), INTRINSICS, looking(turn @ (0.1, 0.2, 0.0), turn @ (1.0, 0.0, 0.0)))
+    built, _ = flat_walls(found @ turn.T, every, [np.full((4, 4), np.nan, np.float32)], [picture])
+    assert built.sides.from_plane.all() and len(built.sides.normal) == 6
+    back = built.vertices[built.faces].mean(1) @ turn
+    assert np.abs(np.abs(back) - [2.5, 2.0, 1.25]).min(1).max() < 0.03
+    assert np.abs(built.sides.normal @ turn).max(1).min() > np.cos(np.radians(0.5))
+    area = face_geometry(built.vertices, built.faces)[1]
+    assert area.sum() == pytest.approx(2 * (5 * 4 + 5 * 2.5 + 4 * 2.5), rel=0.02)
+
+
 def test_most_of_a_room_is_not_made_up():
     """Of six sides two were found: the others stay open."""
     vertices, faces = fine(*room(((0, 1), (0, -1), (1, 1), (2, 1))))
