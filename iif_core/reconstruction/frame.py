@@ -43,8 +43,8 @@ class RoomFrame(NamedTuple):
 def room_frame(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLike) -> RoomFrame:
     """Find the vertical, the direction of the walls, and the heights of floor and ceiling.
 
-    The vertical is the direction that much surface faces and that is nearest to the mean vertical of the cameras; without one, it
-    is that of the cameras. Floor and ceiling are the heights where most of the level surface lies near the ends.
+    The vertical is the direction that most surface faces of those near the mean vertical of the cameras; without one, it is that
+    of the cameras. Floor and ceiling are the heights where most of the level surface lies near the ends.
 
     Args:
         vertices, faces: (n, 3) and (m, 3), in any unit.
@@ -55,9 +55,9 @@ def room_frame(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLi
     up = -np.asarray(world_from_camera, np.float64)[:, :3, 1].mean(0)
     up /= max(float(np.linalg.norm(up)), 1e-12)
     found = directions(normal, area)
-    nearest = found[np.abs(found @ up).argmax()]
-    if abs(nearest @ up) >= UPRIGHT:
-        up = nearest * np.sign(nearest @ up)
+    upright = found[np.abs(found @ up) >= UPRIGHT]
+    if len(upright):  # the largest: cameras that look down lean
+        up = upright[0] * np.sign(upright[0] @ up)
     middle = vertices[faces].mean(1)
 
     # -------- the floor tells the vertical best --------

@@ -285,6 +285,20 @@ def test_walls_are_turned_to_the_axes(angle):
     np.testing.assert_allclose(np.sort(np.ptp(back, axis=0)), [2.5, 4.0, 5.0], atol=1e-6)
 
 
+def test_cameras_that_all_look_down_the_same_way_do_not_tilt_the_floor():
+    """Their mean vertical leans by 15 degrees, and so does a board of 4 m²; the floor is larger."""
+    vertices, faces = room()
+    poses = np.array([np.linalg.inv(np.vstack([looking((-2.0, y, 1.0), (1.7, y, 0.0)), [0, 0, 0, 1]])) for y in (-0.5, 0.0, 0.5)])
+    up = -poses[:, :3, 1].mean(0)
+    across = np.array([0.0, 1.0, 0.0])
+    along = np.cross(across, up)
+    board = np.array([along + across, -along + across, -along - across, along - across])
+    every = np.concatenate([faces, np.array([[0, 1, 2], [0, 2, 3]]) + len(vertices)])
+    assert 10 < np.degrees(np.arccos(up[2] / np.linalg.norm(up))) < 20
+    frame = room_frame(np.concatenate([vertices, board]), every, poses)
+    assert frame.turn[2, 2] > np.cos(np.radians(0.5))
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_frame_of_a_room_is_found_whichever_way_it_lies(seed):
     vertices, faces = room(((1, 1),))
