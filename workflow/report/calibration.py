@@ -30,5 +30,5 @@ def words(light: str, level: str, meaning: str) -> str:
     made = f"{found['captures']} results of rendered captures, good and spoilt"
     counts = found["lights"][light][level]
     if level == "green":
-        return f"Green means that {meaning}. It did in {counts['right']} of the {counts['of']} green ones of {made}."
-    return f"Green means that {meaning}. Of {made}, {counts['of']} were {level} here, and it did in {counts['right']} of them."
+        return f"Green means that {meaning}. That was true of {counts['right']} of the {counts['of']} green ones of {made}."
+    return f"Green means that {meaning}. Of {made}, {counts['of']} were {level} here; it was true of {counts['right']} of them all the same."
