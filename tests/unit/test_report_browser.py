@@ -64,7 +64,7 @@ def content():
         plan=[dict(component="sun", included=False, status="settled", measure="m", value=1.0, threshold=2.0, reason="r")],
         tables=[Table("Scores", [("albedo", 1)], ["L2 ↓"], [["base", "0.1"], ["result", "0.01"]], explained=["albedo-raw-l2"])],
         pairs=[pair("v2", 20.0), pair("v1", 25.0)], pairs_note="Drag.", views=[view("v2"), view("v1")],
-        objects=objects, objects_note="Intervals.",
+        objects=objects, objects_note="Intervals.", overview=pair("v1", 25.0).photograph.source,
         emitters=[emitter, {**emitter, "id": 1, "kept": False, "reason": "dark"}], emitter_note="", response_note="A curve.",
         response_svg=pic.curves_svg([(line, line**0.5, "red", False)], "Response"),
         timings=[{"rule": "base", "seconds": 1.0, "cpu_seconds": 2.0, "max_rss_mb": 3.0, "threads": 2, "expected": {}}],

@@ -9,8 +9,7 @@ from typing import Any
 
 from workflow import plugins
 from workflow.costs.work import SceneSize
-from workflow.intake.pictures import PHOTOGRAPHS
-from workflow.intake.raws import RAW
+from workflow.intake.pictures import PHOTOGRAPHS, RAW
 
 EXTRAS = {"truth", "masks", "instances", "depth", "predictions"}
 """Folders of a scene whose pictures are not photographs (docs/guide/own-data.md#4-the-folder)."""

@@ -18,6 +18,8 @@ FORMATS = ("PNG", "JPEG", "HEIF", "AVIF", "TIFF", "WEBP", "BMP")
 not used. MPO, which telephones write as .jpg, is opened as JPEG; HEIF is read by pi-heif."""
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".exr", ".heic", ".heif", ".avif", ".tif", ".tiff", ".webp", ".bmp")
 """Extensions of photographs, and of maps that belong to them."""
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+"""Extensions of raw files of cameras, which are read by LibRaw (workflow/intake/raws.py)."""
 TEXTURES = ("PNG", "JPEG", "BMP", "TGA", "PPM")
 """The same for textures of Mitsuba scenes and of meshes."""
 PNG_MAGIC = b"\x89PNG"

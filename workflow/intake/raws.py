@@ -20,8 +20,6 @@ from iif_core.errors import InputError
 from workflow.intake.documents import check_file, reading
 from workflow.intake.pictures import check_pixels
 
-RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
-"""Extensions of raw files."""
 DEVELOP = "Develop all of them to linear EXR in sRGB primaries (darktable-cli <name>.DNG <name>.exr), or to JPEG"
 _LARGEST_FILE = 1 << 30
 _ORIENTATION = {0: 1, 3: 3, 5: 8, 6: 6}

@@ -13,7 +13,8 @@ import numpy as np
 from iif_core.errors import InputError
 from workflow.intake import limits
 from workflow.intake.names import existing, fault_of_name, same_name, shown
-from workflow.intake.raws import DEVELOP, RAW
+from workflow.intake.pictures import RAW
+from workflow.intake.raws import DEVELOP
 from workflow.sources.folder_scene import images
 
 CONVERTERS = {

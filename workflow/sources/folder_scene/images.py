@@ -15,8 +15,8 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.intake.documents import reading
-from workflow.intake.pictures import FORMATS, PHOTOGRAPHS, ExrWindows, exr_chromaticities, exr_windows, opened
-from workflow.intake.raws import RAW, raw_header, raw_pixels
+from workflow.intake.pictures import FORMATS, PHOTOGRAPHS, RAW, ExrWindows, exr_chromaticities, exr_windows, opened
+from workflow.intake.raws import raw_header, raw_pixels
 from workflow.sources.folder_scene.profiles import SPACES, Space, converted, linear_conversion, of_16_bits
 
 EXTENSIONS = PHOTOGRAPHS + RAW
