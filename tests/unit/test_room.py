@@ -244,7 +244,12 @@ def test_what_a_click_tells():
         **{f"base_colour_{c}_{end}": [v, None] for c in "rgb" for end, v in (("low", 0.1), ("high", 0.3))},
         **{f"{name}{end}": [0.4, None] for name in ("roughness", "metallic") for end in ("", "_low", "_high")},
     }  # fmt: skip
-    door, wall = build.object_facts(columns)
+    vertices = np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0], [0, 0, 3.0]])
+    faces, area = np.array([[0, 1, 2], [0, 2, 3], [0, 1, 4], [0, 3, 4]]), np.array([2.0, 2.0, 3.0, 3.0])
+    middle = build.middles(vertices, faces, np.array([0, 0, -1, 1]), area)
+    assert middle == {0: [1.0, 1.0, 0.0], 1: [0.0, 0.67, 1.0]}
+    door, wall = build.object_facts(columns, middle)
+    assert (door["middle"], wall["middle"]) == (middle.get(door["id"]), middle.get(wall["id"]))
     assert door["views"] == 3 and door["model"] == "colour by factors" and len(door["numbers"]) == 5
     assert door["numbers"][0] == {"name": "albedo, red", "value": 0.2, "low": 0.1, "high": 0.3}
     assert wall["model"] == "not fitted" and wall["views"] == 0 and wall["numbers"][0]["low"] is None

@@ -237,8 +237,21 @@ def interval(name: str, value: float, error: float) -> dict[str, Any]:
     return {"name": name, "value": round(value, 6), "low": round(low, 6), "high": round(high, 6)}
 
 
-def object_facts(columns: Mapping[str, Sequence]) -> list[dict[str, Any]]:
-    """Return what a click on each object says, from the columns of `object_table.object_rows`."""
+def middles(vertices: Array, faces: Array, object_id: Array, area: Array) -> dict[int, list[float]]:
+    """Return object id -> the mean position of its surface, in metres of the world that relightings name places in.
+
+    Args:
+        vertices: (n, 3); faces: (m, 3); object_id, area: (m,) of the faces, -1 = of no object.
+    """
+    known = object_id >= 0
+    of, weight, middle = object_id[known], area[known], vertices[faces[known]].mean(1)
+    total = np.maximum(np.bincount(of, weight), 1e-12)
+    mean = np.stack([np.bincount(of, weight * middle[:, axis]) for axis in range(3)], 1) / total[:, None]
+    return {int(number): [round(float(x), 2) for x in mean[number]] for number in np.unique(of)}
+
+
+def object_facts(columns: Mapping[str, Sequence], middle: Mapping[int, Sequence[float]]) -> list[dict[str, Any]]:
+    """Return what a click on each object says, from the columns of `object_table.object_rows` and from `middles`."""
     labels = {f"base_colour_{c}": f"albedo, {name}" for c, name in zip("rgb", ("red", "green", "blue"), strict=True)}
     labels |= {"roughness": "roughness", "metallic": "metallic"}
     out = []
@@ -255,6 +268,7 @@ def object_facts(columns: Mapping[str, Sequence]) -> list[dict[str, Any]]:
                 "views": columns["photographs"][row] or 0,
                 "pixels": columns["pixels"][row] or 0,
                 "area": columns["area_m2"][row],
+                "middle": middle.get(number),
                 "color": columns["base_colour_hex"][row],
                 "numbers": numbers,
             }

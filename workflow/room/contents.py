@@ -102,4 +102,6 @@ def radiance_of_emitters(job: Job, recovered: Recovered) -> dict[int, list[dict[
 
 def facts_of_objects(job: Job, recovered: Recovered) -> list[dict[str, Any]]:
     columns = recovered_objects(recovered, job.read("affines"), job.read("segmentation").table("objects.parquet"))
-    return build.object_facts(columns)
+    surface = recovered.surface
+    middle = build.middles(surface.vertices, surface.faces, surface.object_id, surface.areas)
+    return build.object_facts(columns, middle)

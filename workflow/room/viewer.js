@@ -684,6 +684,7 @@
         row(table, 'fitted', object.model);
         row(table, 'seen by', `${object.views} photograph${object.views === 1 ? '' : 's'}, ${grouped(object.pixels)} pixels`);
         if (object.area !== null) row(table, 'area', `${number(object.area)} m²`);
+        if (object.middle) row(table, 'middle', `x, y, z = ${object.middle.map((value) => value.toFixed(2)).join(', ')} m`);
         row(table, 'number', String(object.id));
         $('swatch').style.background = object.color;
         $('swatch').hidden = false;
