@@ -93,7 +93,7 @@ def enclosure(
         if square is not None:
             both = np.concatenate([np.asarray(square, np.float64), -np.asarray(square, np.float64)])
             lacking = [n for n in both if (found[:, :3] @ n < ALIKE).all()]
-            planes = [_along_axis(n, middle, normal, area, within, beyond) for n in lacking]
+            planes = [_bounding(n, middle, normal, area, within, beyond, is_axis=True) for n in lacking]
             found = np.concatenate([found, np.array([plane for plane in planes if plane is not None]).reshape(-1, 4)])
         axes_found = np.concatenate([found[:, :3], axes_found])  # a plane tells its direction better than normals do
 
@@ -203,49 +203,41 @@ def _right_angled(directions: NDArray) -> NDArray:
 
 
 def _bounding(
-    outward: NDArray, middle: NDArray, normal: NDArray, area: NDArray, within: NDArray, beyond: float
+    outward: NDArray,
+    middle: NDArray,
+    normal: NDArray,
+    area: NDArray,
+    within: NDArray,
+    beyond: float,
+    is_axis: bool = False,
 ) -> NDArray | None:
-    """Return the outermost plane of one direction (4,): n and d with n . x = d at its outer border; None = none bounds the room.
+    """Return the outermost plane of one direction (4,): n and d with n . x = d; None = none bounds the room.
 
     Args:
         outward: (3,) unit.
         middle, normal, area: (m, 3), (m, 3) and (m,) of the faces.
         within: (k, 3) points that must be inside.
         beyond: largest share of the area behind the plane.
+        is_axis: the plane is square to `outward`, where its surface lies in the mean; otherwise its direction is fitted, and it
+            lies at its outer border.
     """
+    thick, least = (THIN, SQUARE) if is_axis else (BESIDE, LEAST)
     place, faces_it = middle @ outward, np.abs(normal @ outward) >= ALIKE
-    layer = ((place - place.min()) / BESIDE).astype(np.int64)
+    layer = ((place - place.min()) / thick).astype(np.int64)
     own, every = np.bincount(layer, area * faces_it, layer.max() + 2), np.bincount(layer, area, layer.max() + 2)
     behind = np.append(np.cumsum(every[::-1])[::-1], 0.0)
     # A plane may lie across the border of two layers.
     two = own[:-1] + own[1:]
-    fits = (two >= LEAST * area.sum()) & (behind[2 : len(two) + 2] <= beyond * area.sum())
+    fits = (two >= least * area.sum()) & (behind[2 : len(two) + 2] <= beyond * area.sum())
     for k in np.flatnonzero(fits)[::-1]:
-        better, of_plane = fitted_plane(outward, faces_it & (layer >= k) & (layer <= k + 1), middle, normal, area)
+        better, of_plane = outward, faces_it & (layer >= k) & (layer <= k + 1)
+        if not is_axis:
+            better, of_plane = fitted_plane(outward, of_plane, middle, normal, area)
         if not of_plane.any():
             continue
-        at = float((middle[of_plane] @ better).max())
+        at = float(np.average(place[of_plane], weights=area[of_plane]) if is_axis else (middle[of_plane] @ better).max())
         if at >= (within @ better).max():
             return np.append(better, at)
-    return None
-
-
-def _along_axis(
-    outward: NDArray, middle: NDArray, normal: NDArray, area: NDArray, within: NDArray, beyond: float
-) -> NDArray | None:
-    """Return the outermost plane (4,) square to a direction, where its surface lies in the mean; None = there is none. Arguments
-    are those of `_bounding`."""
-    place, faces_it = middle @ outward, np.abs(normal @ outward) >= ALIKE
-    layer = ((place - place.min()) / THIN).astype(np.int64)
-    own, every = np.bincount(layer, area * faces_it, layer.max() + 2), np.bincount(layer, area, layer.max() + 2)
-    behind = np.append(np.cumsum(every[::-1])[::-1], 0.0)
-    two = own[:-1] + own[1:]
-    fits = (two >= SQUARE * area.sum()) & (behind[2 : len(two) + 2] <= beyond * area.sum())
-    for k in np.flatnonzero(fits)[::-1]:
-        own_faces = faces_it & (layer >= k) & (layer <= k + 1)
-        at = float(np.average(place[own_faces], weights=area[own_faces]))
-        if at >= (within @ outward).max():
-            return np.append(outward, at)
     return None
 
 

@@ -71,7 +71,7 @@ class _Marks:
 
     def are_possible(self, count: int) -> bool:
         """Return whether a pixel may still differ in enough of `count` photographs."""
-        return count >= FEWEST_WRITTEN and self.shown - int(self.counts.max()) <= (1 - ALWAYS) * count
+        return self.shown - int(self.counts.max()) <= (1 - ALWAYS) * count
 
     def found(self, border: np.ndarray) -> np.ndarray:
         """Return rectangles around marks, (H, W) bool like `border`, whose edge is none; digits that change lie in between."""
@@ -108,17 +108,19 @@ def find_borders(frames: Sequence[Frame], encoded: bool, read: Callable[[Frame],
         if len(chosen) < FEWEST:
             continue
         count, shown = np.zeros(size[::-1], np.uint8), 0
-        is_lit, marks, bordered = np.zeros(size[::-1], bool), _Marks(size), True
+        is_lit, marks = np.zeros(size[::-1], bool), _Marks(size)
+        bordered, written = True, encoded and len(chosen) >= FEWEST_WRITTEN
         for frame in chosen:
             photo = read(frame)
             border = black_border(photo.pixels, photo.valid, encoded)
             if border.mean() < LARGEST:  # a black photograph says nothing
                 count, shown = count + border, shown + 1
                 is_lit |= photo.valid & (photo.pixels.max(-1) > (BRIGHT if encoded else 0.0))
-            marks.add(photo)
+            if written:
+                marks.add(photo)
             # No pixel can be in enough of them any more.
             bordered &= shown - int(count.max()) <= (1 - MOST) * len(chosen)
-            written = encoded and marks.are_possible(len(chosen))
+            written &= marks.are_possible(len(chosen))
             if not (bordered or written):
                 break
         else:
