@@ -24,7 +24,7 @@ from workflow.registry import STAGES
 from workflow.runtime import fingerprint
 from workflow.runtime.job import run_stage
 from workflow.sources import photographs
-from workflow.sources.folder_scene import images, transforms
+from workflow.sources.folder_scene import frames, images, inputs, transforms
 
 SIZE = np.array([4.0, 3.0, 2.6])
 CAMERA = Pinhole(260.0, 260.0, 160.0, 120.0, 320, 240)
@@ -286,6 +286,19 @@ def test_photographs_are_found_in_folders_and_masks_are_none(tmp_path):
     (tmp_path / "c.png").write_bytes(b"no picture")
     with refused("c.png"):
         photographs.chosen(tmp_path, 10)
+
+
+def test_a_whole_disk_is_no_scene(tmp_path, monkeypatch):
+    (tmp_path / "a/b").mkdir(parents=True)
+    for i in range(3):
+        Image.new("RGB", (8, 6)).save(tmp_path / f"a/b/{i}.png")
+    monkeypatch.setattr(frames, "MOST_FILES", 5)  # two folders and three files
+    assert len(photographs.chosen(tmp_path, 10)) == 3
+    (tmp_path / "a/notes.txt").touch()
+    with refused(tmp_path, "more than 5"):
+        photographs.chosen(tmp_path, 10)
+    with refused(tmp_path, "more than 5"):
+        inputs.find_inputs({"path": str(tmp_path), "unit": "m", "cameras": None}, {}, False)
 
 
 def test_a_height_that_no_room_has_is_refused():

@@ -17,7 +17,7 @@ from workflow.settings.source import FolderSource
 from workflow.sources import folder
 from workflow.sources.folder_scene import images, transforms
 from workflow.sources.folder_scene.entries import evenly_spread, one_range, without_raws
-from workflow.sources.folder_scene.frames import checked_frames, folder_at
+from workflow.sources.folder_scene.frames import checked_frames, files_below, folder_at
 from workflow.sources.folder_scene.inputs import Inputs
 
 CAMERAS, MESH, POINTS = "transforms.json", "mesh.ply", "points.parquet"
@@ -47,7 +47,7 @@ def chosen(root: Path, most: int) -> list[str]:
     Raises:
         InputError: too few, or one that cannot be read.
     """
-    found = sorted(path for path in root.rglob("*") if path.suffix.lower() in images.EXTENSIONS and path.is_file())
+    found = files_below(root, images.EXTENSIONS)
     found = [path for path in found if "masks" not in path.relative_to(root).parts[:-1] and not _hidden(path, root)]
     found = without_raws(found)
     if len(found) < LEAST:

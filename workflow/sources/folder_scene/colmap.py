@@ -20,7 +20,7 @@ from workflow.intake import limits
 from workflow.intake.documents import check_file, reading
 from workflow.intake.names import existing, forward, shown
 from workflow.sources.folder_scene.entries import Entry, fault_of_path
-from workflow.sources.folder_scene.frames import Cameras, checked_frames
+from workflow.sources.folder_scene.frames import Cameras, checked_frames, files_below
 from workflow.sources.folder_scene.images import EXTENSIONS
 
 PARTS = ("cameras", "images", "points3D")
@@ -181,7 +181,7 @@ def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[s
     if points:
         _check_reprojection(model, listed)
     names = {image.name for image in model.images}
-    there = [path for path in sorted(root.rglob("*")) if path.suffix.lower() in EXTENSIONS]
+    there = files_below(root, EXTENSIONS)
     without = [path.name for path in there if path.relative_to(root).as_posix() not in names]
     notes = []
     if without:

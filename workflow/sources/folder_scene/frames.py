@@ -5,6 +5,8 @@ Every message names the file, the frame, the value found, the values allowed and
 
 from __future__ import annotations
 
+import os
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,8 @@ from workflow.sources.folder_scene.entries import Entry, locate, some
 
 SAME_SHAPE = 0.03
 """Difference of the ratio of sides by which a depth image is still one of the same camera."""
+MOST_FILES = 100_000
+"""Files and folders among which those of a scene are looked for; where there are more, a whole disk was named."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +114,21 @@ def folder_at(source: dict[str, Any], holds: str) -> Path:
         found, hint = ("is a file", "") if folder.exists() else ("not found", did_you_mean_path(folder))
         raise InputError(f"{folder}: {found}; `source.path` must be a folder with {holds} (docs/guide/own-data.md).{hint}")
     return folder
+
+
+def files_below(folder: Path, suffixes: Collection[str]) -> list[Path]:
+    """List the files with one of some suffixes (lower case) in a folder and in those below it; links to folders are not followed.
+
+    Raises:
+        InputError: more than `MOST_FILES` lie there.
+    """
+    count, found = 0, []
+    for here, folders, names in os.walk(folder):
+        count += len(folders) + len(names)
+        if count > MOST_FILES:
+            raise InputError(f"{folder}: more than {MOST_FILES:,} files lie below; name the folder of this scene in `source`")
+        found += [Path(here, name) for name in names if os.path.splitext(name)[1].lower() in suffixes]
+    return sorted(path for path in found if path.is_file())
 
 
 def checked_frames(

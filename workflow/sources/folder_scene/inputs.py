@@ -13,7 +13,7 @@ from iif_core.errors import InputError
 from workflow.settings.names import did_you_mean_path
 from workflow.sources.folder_scene import apps, colmap, exposure, images, mesh, photogrammetry, transforms
 from workflow.sources.folder_scene.camera import metres_per_unit
-from workflow.sources.folder_scene.frames import Cameras, Frame, folder_at
+from workflow.sources.folder_scene.frames import Cameras, Frame, files_below, folder_at
 
 TRUTH = ("albedo", "roughness", "metallic", "emission")
 
@@ -144,7 +144,7 @@ def _hint(folder: Path) -> str:
             or colmap.find(below, None)
         ):
             return f" There is one in {below}: set `source.path` to it"
-    foreign = {path.suffix.lower(): path for path in sorted(folder.rglob("*"), reverse=True) if path.suffix.lower() in FOREIGN}
+    foreign = {path.suffix.lower(): path for path in reversed(files_below(folder, FOREIGN))}
     for suffix, what in FOREIGN.items():
         if suffix in foreign and (suffix != ".csv" or _begins_with(foreign[suffix], b"#name")):
             return f" {foreign[suffix].relative_to(folder)} is {what}"
