@@ -122,8 +122,12 @@ announce() {
     needed_mb=$((disk_mb + 500 + (unpacked + bytes) / 1000000 + more_disk_mb + more_mb))
     if [ $needed_mb -lt $((disk_mb + packages_mb)) ]; then needed_mb=$((disk_mb + packages_mb)); fi
     say "to download, less what pip has in its cache: $packages packages ($packages_mb MB) and $build; $needed_mb MB of disk are needed, $free_mb are free"
+    if is_cuda && ! has_gpu; then
+        say "no NVIDIA GPU is found here, and a CPU build of torch needs no packages for CUDA ($more_mb MB): to take one, stop this and set TORCH_INDEX to its index, from PyTorch's installation page (envs/README.md)"
+    fi
     [ "$free_mb" -ge $needed_mb ] || fail "$(too_small "$free_mb")"
 }
+has_gpu() { command -v nvidia-smi >/dev/null && nvidia-smi -L >/dev/null 2>&1; }
 free_mb() { # with what .venv takes now, because it is replaced
     if [ -e $venv ]; then
         echo $(($(df -Pk $venv/ | awk 'NR == 2 {print $4}') / 1024 + $(du -sm $venv/ | cut -f1)))

@@ -206,9 +206,16 @@ def test_the_cuda_builds_need_more_and_all_of_it_by_hash(copy, index, tmp_path):
     environment = index("", listed=True, extra="torch-cuda.lock\t1\t2000\t4000\n")
     _, right = wheel(tmp_path / "wheels", "iif_cuda", "1")
     (copy / "envs/torch-cuda.lock").write_text(f"iif-cuda==1 --hash=sha256:{right[::-1]}\n")
-    result = run(["bash", "envs/setup.sh"], copy, environment)
-    named(result.stderr, "torch 2.13.0", "3 MB", "2000 MB", "6532 MB")
-    named(last_line(result.stderr), "CUDA", "iif-cuda==1", "SHA-256")
+    tools = tmp_path / "gpu"
+    for gpu, code in (("GPU", 0), ("no GPU", 9)):
+        tools.mkdir(exist_ok=True)
+        (tools / "nvidia-smi").write_text(f"#!/bin/sh\nexit {code}\n")
+        (tools / "nvidia-smi").chmod(0o755)
+        (copy / ".venv/.setup").write_text(f"lock torch {copy}\nchecked\n")
+        result = run(["bash", "envs/setup.sh"], copy, {**environment, "PATH": f"{tools}:{environment['PATH']}"})
+        named(result.stderr, "torch 2.13.0", "3 MB", "2000 MB", "6532 MB")
+        assert ("TORCH_INDEX" in result.stderr) == (gpu == "no GPU")
+        named(last_line(result.stderr), "CUDA", "iif-cuda==1", "SHA-256")
 
 
 def test_a_build_that_is_not_listed_is_refused_unless_it_is_chosen(copy, index):
