@@ -119,7 +119,7 @@ def test_scores_are_of_lit_inner_surface_that_neither_shines_nor_lets_light_thro
         for k, keep in enumerate(keeps[stage]):
             albedo, layer = wild * level * light[number] ** keep, f"prior.{k:03d}.albedo" if stage == "prior" else "albedo"
             out |= {f"{layer}.{c}": albedo[..., i] for i, c in enumerate("RGB")}
-        return out
+        return out | ({"cell.id": np.arange(n).reshape(shape).astype(np.uint32)} if stage == "base" else {})
 
     def read(stage):
         json = {"diffuse": {"cell_edge_m": 1.0}}
@@ -137,7 +137,11 @@ def test_scores_are_of_lit_inner_surface_that_neither_shines_nor_lets_light_thro
         no_reference, "read_diffuse", lambda job, view: np.stack([0.5 * seen[int(view.name)], 1.5 * seen[int(view.name)]])
     )
     views = [SimpleNamespace(name="0"), SimpleNamespace(name="1")]
-    rows = {name: scores for name, _, _, scores in no_reference.truth_free_scores(SimpleNamespace(read=read), capture, views)}
+    photo = ((light[0] * light[1]) ** 0.5 * wild * level).reshape(-1, 3)  # the mean of two photographs that are taken for albedo
+    found = no_reference.truth_free_scores(SimpleNamespace(read=read), capture, views, photo)
+    rows = {name: scores for name, _, _, scores in found}
+    correlation, slope, spread = (score.value for score in rows["photo_as_albedo"])
+    assert 0.6 < correlation < 0.8 and slope == pytest.approx(0.5, abs=0.05) and spread < 1e-6
     apart = (np.log(light[0] / light[1])[~off][:, 0] ** 2 / 2).mean() ** 0.5
     for name, keep in (("result", 0.2), ("base", 0.5), ("prior_k0", 0.8), ("prior_mean_k", 0.9)):
         found = [score.value for score in rows[name]]

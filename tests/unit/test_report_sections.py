@@ -70,6 +70,8 @@ def test_numbers_at_the_head_name_what_would_be_good():
     assert list(found) == ["rgb-raw-psnr", "albedo-raw-shading-left"]
     assert found["rgb-raw-psnr"].value == "25.0 dB" and found["rgb-raw-psnr"].good == "good from 20 dB"
     assert found["albedo-raw-shading-left"].good == "0 is none"
+    means["photo_as_albedo"] = {"albedo": {"raw": {"shading_left": {"mean": 0.8}}}}
+    assert "0.800" in scores.head_numbers(means)[1].good
     assert {key for key, *_ in scores.explanations(means)} == set(found)
 
 

@@ -107,7 +107,9 @@ def head_numbers(means: Means) -> list[Number]:
         if entry:
             metric = METRICS[column[-1]]
             text = f"{entry['mean']:.{1 if metric.unit else metric.decimals}f}{' ' + metric.unit if metric.unit else ''}"
-            good = f"good from {LIMITS[limit].amber:g} {metric.unit}" if limit else "0 is none"
+            photo = found(means, *column, "photo_as_albedo")
+            none = "0 is none" + (f", the photographs have {photo['mean']:.{metric.decimals}f}" if photo else "")
+            good = f"good from {LIMITS[limit].amber:g} {metric.unit}" if limit else none
             out.append(Number(label, text, explanation_key(*column), good))
     return out
 

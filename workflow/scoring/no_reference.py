@@ -21,8 +21,11 @@ DARK = 0.02
 """Share of the median light below which pixels are left out, because light and albedo are noise there."""
 
 
-def truth_free_scores(job: Job, capture: CaptureReader, views: list[View]) -> Iterator[tuple[str, str, str, list[Score]]]:
-    """Score the albedo of `result`, `base` and `prior_k0`, and the mean of the scores of all predictions (`prior_mean_k`).
+def truth_free_scores(
+    job: Job, capture: CaptureReader, views: list[View], photo: np.ndarray
+) -> Iterator[tuple[str, str, str, list[Score]]]:
+    """Score the albedo of `result`, `base`, `prior_k0` and `photo_as_albedo`, whose values `photo` (cells + 1, 3) are given, and
+    the mean of the scores of all predictions (`prior_mean_k`).
 
     The light is the diffuse light of stage shading (mean of its halves) at interior pixels of surface that neither emits nor lets
     light through, in the `views`, none of which is held out. The surface cells are those of its edge. Yields (variant, view,
@@ -42,12 +45,12 @@ def truth_free_scores(job: Job, capture: CaptureReader, views: list[View]) -> It
         points = capture.points(view, capture.gbuffer(view)[0])[use]
         own = object_id[use]
         keys = pack_keys(voxel_indices(points, edge, origin), own % 65535)
-        for name, albedo in _albedos(job, view):
+        for name, albedo in _albedos(job, view, photo):
             left.setdefault(name, ShadingLeft()).add(albedo[use], light[use], own)
             spread.setdefault(name, ViewSpread()).add(albedo[use], keys)
     rows = {name: _scores(left[name], spread[name]) for name in left}
     each = [scores for name, scores in rows.items() if name.startswith("prior.")]
-    for name in ("result", "base"):
+    for name in ("result", "base", "photo_as_albedo"):
         if name in rows:
             yield name, EVERY_VIEW, "albedo", rows[name]
     if each:
@@ -78,11 +81,15 @@ def _light(job: Job, capture: CaptureReader, view: View, mixed: np.ndarray) -> t
     return light, use & (brightness > DARK * float(np.median(brightness[use])) if use.any() else use), object_id
 
 
-def _albedos(job: Job, view: View) -> Iterator[tuple[str, np.ndarray]]:
+def _albedos(job: Job, view: View, photo: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     file = f"maps/{view.name}.exr"
     for name, stage in (("result", "affines"), ("base", "base")):
         if job.read(stage).has(file):
-            yield name, rgb(job.read(stage).exr(file), "albedo")
+            channels = job.read(stage).exr(file)
+            yield name, rgb(channels, "albedo")
+            if name == "base":
+                shown = photo[ids_from_disk(channels["cell.id"])]
+                yield "photo_as_albedo", np.where(shown > 0, shown, np.nan)  # what no photograph shows is left out
     if job.read("prior").has(file):
         channels = job.read("prior").exr(file)
         for k in prediction_numbers(channels):

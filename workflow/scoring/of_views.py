@@ -83,7 +83,7 @@ def scores_of_view(
             cell_id = ids_from_disk(channels["cell.id"]) if variant == "base" else cell_id
             for quantity in PROPERTIES:
                 yield variant, view.name, quantity, _scores(materials, variant, material_maps(channels), quantity)
-    if cell_id is not None and others.albedo is not None:
+    if cell_id is not None:
         maps = {"albedo": others.albedo[cell_id]}
         yield "photo_as_albedo", view.name, "albedo", _scores(materials, "photo_as_albedo", maps, "albedo")
     if not job.read("prior").has(file):

@@ -30,8 +30,8 @@ class OtherPhotographs:
     """The photographs that are used as radiance, by the response and the gains that were found.
 
     Attributes:
-        albedo: (cells + 1, 3) float32 in a capture with truth: the mean radiance that they show of every cell of the base, taken
-            for its albedo (Eq. E.23); 0 in cells that none shows, and in the last row.
+        albedo: (cells + 1, 3) float32, the mean radiance that they show of every cell of the base, taken for its albedo (Eq.
+            E.23); 0 in cells that none shows, and in the last row.
     """
 
     def __init__(self, job: Job, capture: CaptureReader):
@@ -39,7 +39,7 @@ class OtherPhotographs:
         self._curve, self._gains = read_response(job.read("affines")), read_gains(job)
         self._normals = face_geometry(*capture.mesh())[0]
         self._number = {view.view_id: number for number, view in enumerate(capture.views)}
-        self.albedo = self._as_albedo() if capture.has_truth else None
+        self.albedo = self._as_albedo()
 
     def _factor(self, view: View) -> np.ndarray:
         each = np.arange(view.height * view.width)

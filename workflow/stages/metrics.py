@@ -45,7 +45,7 @@ def run(job: Job) -> None:
             for entry in scored:
                 rows.add(*entry)
             job.progress(done + 1, len(views), "views scored")
-    for entry in truth_free_scores(job, capture, used):
+    for entry in truth_free_scores(job, capture, used, others.albedo):
         rows.add(*entry)
     if capture.has_truth:
         rows.add("result", EVERY_VIEW, "rgb", light_error(job, capture, used))
