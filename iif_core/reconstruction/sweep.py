@@ -358,27 +358,3 @@ def _best(total: NDArray, cost: NDArray) -> NDArray:
             bend = before - 2 * here + after
             out[y, x] = at + (0.5 * (before - after) / bend if bend > 0 else 0.0)
     return out
-
-
-def agreed(
-    depth: NDArray, reference: Picture, others: Sequence[tuple[NDArray, Picture]], tolerance: float = 0.015, least: int = 1
-) -> NDArray:
-    """Return the depth (H, W) where at least `least` other depth maps have the same surface, NaN elsewhere.
-
-    Args:
-        depth: z-depth of the reference, NaN = unknown.
-        others: depth maps with their pictures.
-        tolerance: largest relative difference of depths.
-        least: number of maps that must agree.
-    """
-    height, width = depth.shape
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(reference.intrinsics).T
-    camera = reference.camera_from_world
-    points = (rays * depth[..., None] - camera[:, 3]) @ camera[:, :3]
-    count = np.zeros(depth.shape, np.int64)
-    for other, picture in others:
-        row, column, z, inside = picture.pixels(points, other.shape)
-        with np.errstate(invalid="ignore"):
-            count += inside & (np.abs(other[row, column] - z) <= tolerance * z)
-    return np.where(count >= least, depth, np.nan).astype(np.float32)

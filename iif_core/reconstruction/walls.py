@@ -32,9 +32,11 @@ OVERLAP = 0.2
 """How far (m) they overlap."""
 CLOSES = 0.5
 """Share of the sides that must be planes for those at the extent to be built: they close a room, and do not make one up."""
-LAYER, ANGLE, MOST_FACES = 0.03, 0.25, 50_000
-"""Thickness (m) of the layers by which the direction of the walls is told, steps (degrees) in which it is looked for, and faces
-that are counted."""
+LAYERS = ((0.03, 0.25, 45.0), (0.01, 0.05, 0.25))
+"""Of two searches, the second about what the first finds: thickness (m) of the layers by which the direction of the walls is
+told, steps (degrees) in which it is looked for, and how far to either side."""
+MOST_FACES = 50_000
+"""Faces that are counted."""
 THROUGH = 0.05
 """Share by which a depth map must look beyond a tile to say that nothing is there."""
 BEYOND = 0.05
@@ -60,6 +62,21 @@ class Walls(NamedTuple):
     found: NDArray
     sides: Enclosure
     error: NDArray
+
+    def height(self) -> float | None:
+        """Return the distance of floor and ceiling (m) in the middle of the room; None unless both prolong planes of the mesh."""
+        level = np.abs(self.sides.normal[:, 2]) > ALONG
+        if level.sum() != 2 or not self.sides.from_plane[level].all():
+            return None
+        middle = self.sides.vertices.mean(0)
+        at = [self.sides.vertices[self.sides.faces[self.sides.side == i][0, 0]] for i in np.flatnonzero(level)]
+        normal = self.sides.normal[level]
+        return float(np.abs(np.einsum("ij,ij->i", at - middle, normal) / normal[:, 2]).sum())
+
+    def scaled(self, factor: float) -> Walls:
+        """Return the same, larger by a factor."""
+        sides = self.sides._replace(vertices=self.sides.vertices * factor)
+        return self._replace(vertices=self.vertices * factor, sides=sides, error=self.error * factor)
 
     def turned(self, turn: NDArray) -> Walls:
         """Return the same after a rotation (3, 3) of the world."""
@@ -128,7 +145,7 @@ def room_axes(middle: NDArray, normal: NDArray, area: NDArray) -> NDArray:
 
     argmax over phi of sum_b h_b(phi)^2 + sum_b h'_b(phi)^2 (docs/method/reconstruction.md, Eq. D.4),
 
-    with the area h_b, h'_b in layers of `LAYER` along both axes. Normals alone are off by degrees on noisy surface.
+    with the area h_b, h'_b in layers along both axes (`LAYERS`). Normals alone are off by degrees on noisy surface.
 
     Args:
         middle, normal: (m, 3) of the faces, metres; area: (m,).
@@ -136,15 +153,19 @@ def room_axes(middle: NDArray, normal: NDArray, area: NDArray) -> NDArray:
     upright = np.flatnonzero(np.abs(normal[:, 2]) < np.sqrt(1 - ALONG**2))
     upright = upright[:: max(1, len(upright) // MOST_FACES)]
     place, weight = middle[upright, :2] - middle[upright, :2].mean(0), area[upright]
-    angles = np.radians(np.arange(-45, 45, ANGLE))
+    if not len(upright):
+        return np.eye(3)
 
-    def layers(along: NDArray) -> float:
-        number = np.rint(along / LAYER).astype(np.int64)
+    def packed(along: NDArray, layer: float) -> float:
+        number = np.rint(along / layer).astype(np.int64)
         return float(np.square(np.bincount(number - number.min(), weight)).sum())
 
-    axes = np.stack([np.cos(angles), np.sin(angles)], 1)
-    packed = [layers(place @ (x, y)) + layers(place @ (-y, x)) for x, y in axes] if len(upright) else [0.0]
-    x, y = axes[int(np.argmax(packed))] if len(upright) else (1.0, 0.0)
+    best = 0.0
+    for layer, step, reach in LAYERS:
+        angles = np.radians(np.arange(-reach, reach, step)) + best
+        axes = np.stack([np.cos(angles), np.sin(angles)], 1)
+        best = float(angles[np.argmax([packed(place @ (x, y), layer) + packed(place @ (-y, x), layer) for x, y in axes])])
+    x, y = np.cos(best), np.sin(best)
     return np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]])
 
 

@@ -24,6 +24,8 @@ SQUARE = 0.004
 """Least share of the area that makes a plane along a given axis, of which only the place is to be found."""
 THIN = 0.05
 """Thickness (m) of the layers in which it is looked for."""
+SNAPS = float(np.cos(np.radians(3.0)))
+"""Cosine of the angle up to which a plane is square to a given axis, and its tilt is noise."""
 _BINS = 32  # of normals, along each axis
 _SHIFTS, _FITS = 8, 6
 _DIRECTIONS = 24  # of planes that are looked at, the largest first
@@ -71,8 +73,8 @@ def enclosure(
         noise: share of the area that is left out at each end of the extent; 0 = the extent of all vertices.
         shown: (p, 3) further points of surface, of which some may be far off; sides at the extent lie no nearer than the
             outermost layer that holds one in a hundred of them.
-        square: (3, 3) axes of a room, unit and at right angles: where no large plane bounds it along one of them, a smaller one
-            does (`SQUARE`).
+        square: (3, 3) axes of a room, unit and at right angles: planes that are nearly square to one of them are (`SNAPS`), and
+            where no large plane bounds it along one of them, a smaller one does (`SQUARE`).
 
     Returns:
         The surface. It contains all points, and the scan but for what lies behind its planes and for noise.
@@ -92,9 +94,11 @@ def enclosure(
         found = np.array([plane for plane in planes if plane is not None]).reshape(-1, 4)
         if square is not None:
             both = np.concatenate([np.asarray(square, np.float64), -np.asarray(square, np.float64)])
-            lacking = [n for n in both if (found[:, :3] @ n < ALIKE).all()]
-            planes = [_bounding(n, middle, normal, area, within, beyond, is_axis=True) for n in lacking]
-            found = np.concatenate([found, np.array([plane for plane in planes if plane is not None]).reshape(-1, 4)])
+            found = found[(found[:, :3] @ both.T < SNAPS).all(1)]
+            for least in (LEAST, SQUARE):
+                lacking = [n for n in both if (found[:, :3] @ n < ALIKE).all()]
+                planes = [_bounding(n, middle, normal, area, within, beyond, least, is_axis=True) for n in lacking]
+                found = np.concatenate([found, np.array([plane for plane in planes if plane is not None]).reshape(-1, 4)])
         axes_found = np.concatenate([found[:, :3], axes_found])  # a plane tells its direction better than normals do
 
     # -------- sides along the axes of the room where there is none, at the extent of everything --------
@@ -209,6 +213,7 @@ def _bounding(
     area: NDArray,
     within: NDArray,
     beyond: float,
+    least: float = LEAST,
     is_axis: bool = False,
 ) -> NDArray | None:
     """Return the outermost plane of one direction (4,): n and d with n . x = d; None = none bounds the room.
@@ -218,10 +223,11 @@ def _bounding(
         middle, normal, area: (m, 3), (m, 3) and (m,) of the faces.
         within: (k, 3) points that must be inside.
         beyond: largest share of the area behind the plane.
+        least: least share of the area that makes a plane.
         is_axis: the plane is square to `outward`, where its surface lies in the mean; otherwise its direction is fitted, and it
             lies at its outer border.
     """
-    thick, least = (THIN, SQUARE) if is_axis else (BESIDE, LEAST)
+    thick = THIN if is_axis else BESIDE
     place, faces_it = middle @ outward, np.abs(normal @ outward) >= ALIKE
     layer = ((place - place.min()) / thick).astype(np.int64)
     own, every = np.bincount(layer, area * faces_it, layer.max() + 2), np.bincount(layer, area, layer.max() + 2)

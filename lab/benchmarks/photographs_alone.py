@@ -196,7 +196,7 @@ def _db(found: np.ndarray, true: np.ndarray) -> float:
 def row_of(folder: Path, room: str, views: int, width: int, height: int) -> dict[str, Any]:
     """Make a room both ways and return what there is to say of them."""
     packed = photographed(folder, room, views, width, height)
-    tall = float(np.ptp(np.asarray(trimesh.load(packed / "mesh.ply", process=False).vertices)[:, 2]))
+    tall = float(rooms.build(room).size[2])
     sources = {
         "alone": f"{{kind: photographs, path: data/{room}-alone, room_height: {tall:.3f}}}",
         "given": f"{{kind: folder, path: data/{room}}}",

@@ -130,6 +130,20 @@ case("misspelt key")(lambda root: loaded(root, "capture: {veiws: 3}\n"))
 case("empty view list: `capture.views: 0`")(lambda root: loaded(root, "capture: {views: 0}\n"))
 
 
+case("a word in the place of a section")(lambda root: loaded(root, "affines: {scale: {white_patch: paper}}\n"))
+case("a key of `source` outside of it")(lambda root: loaded(root, "unit: mm\n"))
+case("a tab in a scene file")(lambda root: loaded(root, "capture:\n\tviews: 3\n"))
+case("a line that is indented by one too many")(lambda root: loaded(root, "capture:\n  views: 3\n   width: 64\n"))
+
+
+@case("a room of 27 m")
+def _(root):
+    (root / "config/scenes").mkdir(parents=True)
+    (root / "config/scenes/own.yaml").write_text("source: {kind: photographs, path: data/own, room_height: 27.4}\n")
+    with own.working_in(root):
+        return error(lambda: settings.load("own"))
+
+
 @case("K = 0: `prior.samples: 0`")
 def _(root):
     (root / "config/scenes").mkdir(parents=True)

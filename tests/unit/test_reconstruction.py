@@ -8,10 +8,12 @@ import trimesh
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
+from iif_core.reconstruction.agreement import agreed, votes
+from iif_core.reconstruction.flat import flat_depth, textured
 from iif_core.reconstruction.frame import room_frame
 from iif_core.reconstruction.fusing import fused_mesh, large_pieces
 from iif_core.reconstruction.neighbours import neighbours
-from iif_core.reconstruction.sweep import Picture, SweepOptions, _add_path, agreed, swept_depth
+from iif_core.reconstruction.sweep import Picture, SweepOptions, _add_path, swept_depth
 from iif_core.reconstruction.walls import flat_walls, turn_to_walls
 from iif_core.surface.triangles import face_geometry
 from tests.unit.test_enclosure import room
@@ -115,6 +117,83 @@ def test_depth_on_which_others_do_not_agree_is_dropped():
     assert np.isfinite(kept[inner]).all()
     unknown = np.full_like(spoilt, np.nan)
     assert np.isnan(agreed(spoilt, pictures[0], [(unknown, pictures[1])], least=1)).all()
+
+
+def two_walls():
+    """Two regions of one grey, each on a plane of its own; grey, true depth, and the right one."""
+    grey, right = np.full((HEIGHT, WIDTH), 0.3, np.float32), np.arange(WIDTH)[None] >= WIDTH // 2
+    grey[:, WIDTH // 2 :] = 0.7
+    depth = np.where(right, depth_on(POSES[0], normal=np.array([-0.3, 0.0, 1.0]), offset=4.0)[0], depth_on(POSES[0])[0])
+    return grey, depth, np.broadcast_to(right, grey.shape)
+
+
+def test_a_region_of_one_colour_has_the_plane_of_its_known_pixels():
+    """Depth is known along the border of the picture, in noise of 0.3 %, a third of it of what stands in front. The other region
+    is known on too few pixels, then on noise that is no plane."""
+    grey, depth, right = two_walls()
+    rng = np.random.default_rng(0)
+    border = np.ones(grey.shape, bool)
+    border[4:-4, 4:-4] = False
+    known = np.where(border & ~right, depth * (1 + rng.normal(0, 0.003, grey.shape)), np.nan)
+    front = border & (rng.random(grey.shape) < 0.35)
+    known[front] *= 0.8
+    few = np.flatnonzero((right & border).ravel())[:20]
+    known.ravel()[few] = depth.ravel()[few]
+    found = flat_depth(grey, known)
+    assert found.dtype == np.float32 and np.isnan(found[right]).all()
+    inner = np.s_[:, : WIDTH // 2 - 3]  # the border of the regions is not exact
+    assert np.abs(found[inner] / depth[inner] - 1).max() < 0.002  # also where what stands in front was taken for it
+    known[right] = rng.uniform(1.0, 5.0, grey.shape)[right]
+    assert np.isnan(flat_depth(grey, known)[right]).all()
+
+
+def test_planes_reach_as_far_as_their_pixels_tell():
+    """A corner of 8 x 8 pixels tells the plane beside it, not at the other end; pixels on a line tell none."""
+    grey = np.full((HEIGHT, WIDTH), 0.5, np.float32)
+    depth, _ = depth_on(POSES[0])
+    noisy = depth * (1 + np.random.default_rng(0).normal(0, 0.003, depth.shape))
+    known = np.full(depth.shape, np.nan)
+    known[:8, :8] = noisy[:8, :8]
+    found = flat_depth(grey, known)
+    assert np.isfinite(found[2:6, 2:6]).all() and np.isnan(found[-20:, -20:]).all()
+    assert np.nanmax(np.abs(found / depth - 1)) < 0.03
+    known = np.full(depth.shape, np.nan)
+    known[30] = depth[30]
+    assert np.isnan(flat_depth(grey, known)).all()
+    assert np.isnan(flat_depth(grey, np.full(depth.shape, np.nan))).all()
+    # -------- and all of it where they lie around it, in any unit --------
+    known = np.where(np.arange(WIDTH)[None] % 12 == 0, noisy, np.nan)
+    for unit in (1e-3, 1.0, 1e4):
+        assert np.abs(flat_depth(grey, unit * known) / (unit * depth) - 1).max() < 0.005
+
+
+def test_texture_is_of_the_pixel_and_not_of_what_is_beside_it():
+    grey = np.full((40, 40), 0.4, np.float32)
+    grey[:, 20:] = 0.8
+    grey[25:, :12] += 0.05 * np.random.default_rng(0).normal(size=(15, 12)).astype(np.float32)
+    found = textured(grey)
+    assert found[:, 19:21].all() and not found[:20, 16:18].any() and not found[:20, 22:24].any()
+    assert not found[:20, :15].any() and found[28:-2, 2:8].mean() > 0.9
+
+
+def test_depth_maps_speak_for_surface_and_against_it():
+    pictures = [photograph(pose) for pose in POSES]
+    depths = [depth_on(pose)[0].astype(np.float32) for pose in POSES]
+    floats = depths[0].copy()
+    floats[20:30, 40:50] *= 0.8
+    unknown = np.full_like(floats, np.nan)
+    others = [(depth, depth, picture) for depth, picture in zip(depths[1:], pictures[1:], strict=True)]
+    same, through = votes(floats, pictures[0], others)
+    inner = np.s_[10:-10, 18:-18]
+    patch = np.zeros(floats.shape, bool)
+    patch[20:30, 40:50] = True
+    assert (same[inner][~patch[inner]] == 3).all() and (through[~patch] == 0).all()
+    assert (same[patch] == 0).all() and (through[patch] == 3).all()
+    # -------- one map may only speak for, another only against --------
+    same, through = votes(floats, pictures[0], [(depths[1], unknown, pictures[1]), (unknown, depths[2], pictures[2])])
+    assert (same[inner][~patch[inner]] == 1).all() and (through[patch] == 1).all()
+    behind = votes(1.2 * depths[0], pictures[0], others)
+    assert not behind[0].any() and not behind[1].any()  # surface in front hides it
 
 
 def test_neighbours_show_the_same_from_a_little_aside():
@@ -253,6 +332,29 @@ def test_a_wall_without_texture_is_found_by_what_hangs_on_it(angle):
     assert area.sum() == pytest.approx(2 * (5 * 4 + 5 * 2.5 + 4 * 2.5), rel=0.02)
 
 
+@pytest.mark.parametrize("tilt, upright", [(2.0, True), (6.0, False)])
+def test_a_wall_leans_only_if_it_leans_by_more_than_noise(tilt, upright):
+    vertices, faces = fine(*room())
+    wall = vertices[:, 0] > 2.49
+    vertices[wall, 0] -= np.tan(np.radians(tilt)) * (vertices[wall, 2] + 1.25)
+    picture = Picture(np.zeros((4, 4), np.float32), INTRINSICS, looking((0.1, 0.2, 0.0), (1.0, 0.0, 0.0)))
+    built, _ = flat_walls(vertices, faces, [np.full((4, 4), np.nan, np.float32)], [picture])
+    leaning = np.degrees(np.arcsin(np.abs(built.sides.normal[np.argmin(built.sides.normal[:, 0]), 2])))
+    assert built.sides.from_plane.all()
+    assert leaning == pytest.approx(0.0 if upright else tilt, abs=0.3)
+    assert built.height() == pytest.approx(2.5, abs=1e-3)
+    larger = built.scaled(2.0)
+    assert larger.height() == pytest.approx(5.0, abs=2e-3)
+    np.testing.assert_allclose(larger.vertices, 2 * built.vertices)
+    np.testing.assert_allclose(larger.error, 2 * built.error)
+
+
+def test_a_room_without_a_ceiling_has_no_height():
+    vertices, faces = fine(*room(((2, 1),)))
+    picture = Picture(np.zeros((4, 4), np.float32), INTRINSICS, looking((0.1, 0.2, 0.0), (1.0, 0.0, 0.0)))
+    assert flat_walls(vertices, faces, [np.full((4, 4), np.nan, np.float32)], [picture])[0].height() is None
+
+
 def test_most_of_a_room_is_not_made_up():
     """Of six sides two were found: the others stay open."""
     vertices, faces = fine(*room(((0, 1), (0, -1), (1, 1), (2, 1))))
@@ -282,7 +384,7 @@ def test_walls_are_turned_to_the_axes(angle):
     picture = Picture(np.zeros((4, 4), np.float32), INTRINSICS, looking((0.1, 0.2, 0.0), (1.0, 0.0, 0.0)))
     walls, _ = flat_walls(turned, faces, [np.full((4, 4), np.nan, np.float32)], [picture])
     back = turned @ turn_to_walls(walls).T
-    np.testing.assert_allclose(np.sort(np.ptp(back, axis=0)), [2.5, 4.0, 5.0], atol=1e-6)
+    np.testing.assert_allclose(np.sort(np.ptp(back, axis=0)), [2.5, 4.0, 5.0], atol=5e-3)  # 0.05 degrees
 
 
 def test_cameras_that_all_look_down_the_same_way_do_not_tilt_the_floor():

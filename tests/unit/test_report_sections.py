@@ -73,6 +73,9 @@ def test_numbers_at_the_head_name_what_would_be_good():
     means["photo_as_albedo"] = {"albedo": {"raw": {"shading_left": {"mean": 0.8}}}}
     assert "0.800" in scores.head_numbers(means)[1].good
     assert {key for key, *_ in scores.explanations(means)} == set(found)
+    means["result"]["rgb_held_out"] = means["result"]["rgb"]
+    means["photo_mean"] = {"rgb_held_out": {"raw": {"psnr": {"mean": 23.66}}}}
+    assert "23.7" in scores.head_numbers(means)[0].good
 
 
 def test_views_go_from_worst_to_best_and_those_without_a_score_come_last():

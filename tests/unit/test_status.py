@@ -383,13 +383,13 @@ def test_which_scenes_are_shown(project):
         Path(f"results/{name}/logs").mkdir(parents=True)
     assert status.scenes_to_show() == ["a", "b"]
     Path("config/batch.tsv").write_text("name\tbase\nx\ta\ny\ta\n")
-    assert status.scenes_to_show() == ["x", "y"]
+    assert status.scenes_to_show() == ["x", "y", "a"]  # it has settings and results, and is no line of the table
     JobState("b", "base", "mark").started()  # asked for by name, in addition to the batch
     JobState("a--fast", "base", "mark").failed("no light")
     JobState("gone", "base", "mark").failed("no light")  # it was taken out of the table, and its file with it
-    assert status.scenes_to_show() == ["x", "y", "a--fast", "b"]
+    assert status.scenes_to_show() == ["x", "y", "a--fast", "b", "a"]
     JobState("gone", "base", "mark").started()
-    assert status.scenes_to_show() == ["x", "y", "a--fast", "b", "gone"]
+    assert status.scenes_to_show() == ["x", "y", "a--fast", "b", "gone", "a"]
     assert status.scenes_to_show(["b", "a", "b"]) == ["b", "a"]
 
 

@@ -26,8 +26,8 @@ GAP = "  "
 
 
 def scenes_to_show(named: Sequence[str] = ()) -> list[str]:
-    """Return which scenes are shown: those that are named; or those of the batch table, and others of which jobs run, or
-    did not end well while they still have settings; or, without a table, everything that has a file or a folder in results/.
+    """Return which scenes are shown: those that are named; or those of the batch table, others of which jobs run, and those that
+    have settings and a folder in results/; or, without a table, everything that has a file or a folder in results/.
 
     Raises:
         InputError: the table cannot be read.
@@ -36,9 +36,11 @@ def scenes_to_show(named: Sequence[str] = ()) -> list[str]:
         return list(dict.fromkeys(named))
     lines = batch_table.read_table()
     of_table = [line.name for line in lines]
-    if any(line.number for line in lines):
-        return list(dict.fromkeys([*of_table, *standing.with_running_jobs({*of_table, *scene_names()})]))
     folders = sorted(path.parent.name for path in Path("results").glob("*/logs") if path.is_dir())
+    if any(line.number for line in lines):
+        known = set(scene_names())
+        running = standing.with_running_jobs({*of_table, *known})
+        return list(dict.fromkeys([*of_table, *running, *(name for name in folders if name in known)]))
     return list(dict.fromkeys([*of_table, *(name for name in folders if name not in RESERVED)]))
 
 

@@ -62,7 +62,7 @@ def overview_png(
         drawn = rows[1, column].imshow(depths[view], cmap="viridis", vmin=0, vmax=far)
         for axes in rows[:, column]:
             axes.set_axis_off()
-    below.colorbar(drawn, ax=rows[1, :], label="depth that others confirm (m)")
+    below.colorbar(drawn, ax=rows[1, :], label="depth (m)")
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=110, metadata={"Software": None})
     return out.getvalue()

@@ -67,6 +67,7 @@ def evidence_of(scene: Reported) -> Evidence:
         confirmed=float(np.mean(alone["depth_share"])) if alone else None,
         built=sum(float(side["added_m2"]) for side in alone.get("planes", ())),
         photographs=len(capture.views),
+        added=bool(capture.facts.get("added_faces")),
         lost=sum(map(len, (capture.facts.get("dropped_views") or (), capture.facts.get("left_out_views") or ()))) + unplaced,
         photographed=float(cache[-1]) if cache else scene.document("plan").get("probes", {}).get("photographed_share"),
         stability=scene.document("segmentation").get("stability"),

@@ -110,6 +110,8 @@ def head_numbers(means: Means) -> list[Number]:
             photo = found(means, *column, "photo_as_albedo")
             none = "0 is none" + (f", the photographs have {photo['mean']:.{metric.decimals}f}" if photo else "")
             good = f"good from {LIMITS[limit].amber:g} {metric.unit}" if limit else none
+            other = found(means, *column, "photo_mean")
+            good += f"; the mean of the others has {other['mean']:.1f}" if other else ""
             out.append(Number(label, text, explanation_key(*column), good))
     return out
 

@@ -117,7 +117,26 @@ def _one_of_each_choice(problems: Sequence[Any]) -> list[Any]:
 def _of_another_kind(where: tuple[str | int, ...]) -> str:
     """Say to which other `kind` of a section a key belongs."""
     kinds = [kind for kind, section in UNIONS.get(str(where[0]), {}).items() if where[-1] in section.model_fields]
-    return f" It belongs to `kind: {kinds[0]}`." if kinds else ""
+    if kinds:
+        return f" It belongs to `kind: {kinds[0]}`."
+    of_source = len(where) == 1 and any(where[0] in section.model_fields for section in UNIONS["source"].values())
+    return f" Put it under `source`, as in `source: {{{where[0]}: ...}}`." if of_source else ""
+
+
+def _example_of(where: tuple[str | int, ...]) -> str:
+    """Return what a section is like whose value is none: with its kind, or with what it must have."""
+    if str(where[-1]) in UNIONS:
+        return f"`{where[-1]}: {{kind: ...}}`"
+    section = _section_of((*where, ""))
+    keys = [name for name, field in section.model_fields.items() if field.is_required()] if section else []
+    name = str(where[-2] if len(where) > 1 and _is_alternative([str(part) for part in where], len(where) - 1) else where[-1])
+    return f"`{name}: {{{', '.join(f'{key}: ...' for key in keys) or 'key: value'}}}`"
+
+
+def _in_metres(found: Any) -> str:
+    """Return what a length in another unit probably is in metres, as a question; empty where it is none that a room has."""
+    likely = [found / by for by in (10, 100, 1000) if isinstance(found, int | float) and 1.5 <= found / by <= 10]
+    return f" Did you mean {likely[0]:g}?" if likely else ""
 
 
 def _is_section(found: Any) -> bool:
@@ -163,7 +182,7 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
             lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
         elif kind in ("model_type", "model_attributes_type", "dict_type"):
             lines.append(
-                f"{path}: `{dotted}`: found {shown(found)}, needed `key: value` pairs, e.g. `{where[0]}: {{kind: ...}}`."
+                f"{path}: `{dotted}`: found {shown(found)}, needed `key: value` pairs, e.g. {_example_of(where)}."
             )
         elif kind == "missing":
             example = EXAMPLES.get(str(where[0]), "config/scenes/kitchen.yaml")
@@ -189,7 +208,7 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
                 what += " (metres)"
             other = MEANT.get(dotted, {}).get(found) if isinstance(found, str) else None
             hint = did_you_mean(found, re.findall(r"'([^']*)'", what)) if isinstance(found, str) else ""
-            hint = f" Did you mean '{other}'?" if other else hint
+            hint = f" Did you mean '{other}'?" if other else hint or (_in_metres(found) if dotted in IN_METRES else "")
             lines.append(f"{path}: `{dotted}`: found {said}. {what}.{hint}")
     if len(problems) > SHOWN:
         lines.append(f"... and {len(problems) - SHOWN} more")

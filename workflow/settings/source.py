@@ -96,7 +96,7 @@ class PhotographsSource(PhotographedSource):
     most: int = Field(120, ge=3, le=2000)
     """Largest number of photographs whose cameras are found, evenly spread by name; of those, `capture.views` are used for
     materials."""
-    room_height: float | None = Field(None, gt=0.5, lt=50)
+    room_height: float | None = Field(None, gt=0.5, lt=20)
     """Metres from floor to ceiling, which give the scale."""
     camera_height: float = Field(1.5, gt=0.05, lt=20)
     """Metres above the floor at which the cameras are held (median); a guess of the scale where `room_height` is not given."""

@@ -112,6 +112,14 @@ def parse_yaml(text: str) -> Any:
     return document
 
 
+MISTAKES = {
+    "found character '\\t'": "; YAML takes spaces, no tabs: replace them",
+    "expected <block end>": "; is this line, or the one before, indented like its neighbours?",
+    "mapping values are not allowed": "; is this line indented like its neighbours? A value with a colon needs quotes",
+}
+"""What the parser says -> what people did."""
+
+
 @lru_cache(32)
 def _parsed(text: str) -> Any:
     """Return `parse_yaml(text)`: every scene of a batch lies over the same few files."""
@@ -131,8 +139,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
-        said = getattr(error, "problem", None) or error
-        raise InputError(f"{path}{where}: not valid YAML ({shorter(said)})") from None
+        said = shorter(getattr(error, "problem", None) or error)
+        help_ = next((words for start, words in MISTAKES.items() if start in said), "")
+        raise InputError(f"{path}{where}: not valid YAML ({said}){help_}") from None
     if document is None:
         return {}
     if not isinstance(document, dict):

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
 
 from iif_core.errors import InputError
 from iif_core.numerics.parallel import map_in_order
+from iif_core.reconstruction.agreement import agreed, votes
+from iif_core.reconstruction.flat import flat_depth, textured
 from iif_core.reconstruction.frame import RoomFrame, room_frame
 from iif_core.reconstruction.fusing import fused_mesh, large_pieces
 from iif_core.reconstruction.neighbours import neighbours
-from iif_core.reconstruction.sweep import Picture, agreed, swept_depth
+from iif_core.reconstruction.sweep import Picture, swept_depth
 from iif_core.reconstruction.walls import CLOSES, Walls, flat_walls, turn_to_walls
 from iif_core.surface.triangles import face_geometry
 from workflow.reconstruction.cameras import Sparse, find_cameras, picture_of
@@ -29,6 +31,12 @@ LEAST_OF_MEDIAN = 0.05
 """Least depth that is searched, over the median."""
 AGREE = 2
 """Depth maps of other photographs that must have the same surface."""
+SWEPT, ASKED = 6, 16
+"""Photographs with which each one is compared, and those whose depth speaks for or against its flat regions."""
+FOR_EACH_AGAINST = 2
+"""Depth maps that must show a surface for each one that looks through it."""
+NEAR_FLAT = 0.06
+"""Relative difference up to which the plane of a region replaces depth that others confirm."""
 DOUBTFUL = 0.2
 """Share of a photograph whose depth others confirm, over the median of all, below which its camera is taken for wrong."""
 MANY = 0.1
@@ -54,8 +62,8 @@ def run(job: Job) -> None:
     with job.timed("depth"):
         sparse, pictures, depths = _depths(job, sparse, root)
     with job.timed("mesh"):
-        footprint = np.median([np.nanmedian(z) / p.intrinsics[0, 0] for z, p in zip(depths, pictures, strict=True)])
-        vertices, faces = fused_mesh(depths, pictures, VOXELS * float(footprint))
+        footprint = np.median([np.nanmedian(z) / p.intrinsics[0, 0] for z, p in zip(depths.used, pictures, strict=True)])
+        vertices, faces = fused_mesh(depths.used, pictures, VOXELS * float(footprint))
         if not len(faces):
             raise InputError(
                 f"{root}: no surface on which several photographs agree; take them closer to each other, and of things with"
@@ -73,14 +81,19 @@ def run(job: Job) -> None:
         sparse = sparse.placed(frame.turn, shift, scale)
         vertices = (vertices @ frame.turn.T + shift) * scale
         pictures = [p._replace(camera_from_world=c) for p, c in zip(pictures, sparse.camera_from_world, strict=True)]
-        depths = [z * np.float32(scale) for z in depths]
-        walls, flat = flat_walls(vertices, faces, depths, pictures, sparse.points)
+        # What is taken for flat looks through nothing: it may reach from a wall over the edge of the ceiling.
+        trusted = [z * np.float32(scale) for z in depths.trusted]
+        walls, flat = flat_walls(vertices, faces, trusted, pictures, sparse.points)
+        if source.room_height is not None and (tall := walls.height()):  # flat sides tell it better than the surface did
+            again = source.room_height / tall
+            sparse, scale = sparse.placed(np.eye(3), np.zeros(3), again), scale * again
+            vertices, walls = vertices * again, walls.scaled(again)
         vertices, faces = large_pieces(vertices, faces, ~flat)
         # Along the axes of the world, as fitted walls tell it better than the normals by which the frame was found.
         turn = turn_to_walls(walls)
         sparse, vertices, walls = sparse.placed(turn, np.zeros(3), 1.0), vertices @ turn.T, walls.turned(turn)
         pictures = [p._replace(camera_from_world=c) for p, c in zip(pictures, sparse.camera_from_world, strict=True)]
-    shares = [float(np.isfinite(z).mean()) for z in depths]
+    shares = {"depth_share": depths.confirmed, "used_share": [float(np.isfinite(z).mean()) for z in depths.used]}
     facts = _facts(sparse, frame, scale, basis, walls, len(faces), VOXELS * float(footprint) * scale, shares)
     job.writer.bytes(CAMERAS, transforms_json(sparse))
     both = np.concatenate([vertices, walls.vertices]), np.concatenate([faces, walls.faces + len(vertices)])
@@ -88,21 +101,35 @@ def run(job: Job) -> None:
     seen = sparse.points[sparse.point].astype(np.float32)
     columns = {name: seen[:, i] for i, name in enumerate("xyz")}
     job.writer.table(POINTS, columns | {"view": sparse.view.astype(np.int32)}, dict.fromkeys("xyz", "m"))
-    job.writer.bytes("overview.png", overview_png(sparse, vertices, walls, pictures, depths))
+    job.writer.bytes("overview.png", overview_png(sparse, vertices, walls, pictures, [z * scale for z in depths.used]))
     job.writer.json("reconstruction.json", facts)
     for note in facts["notes"]:
         job.log.info("%s", note)
 
 
-def _depths(job: Job, sparse: Sparse, root: Path) -> tuple[Sparse, list[Picture], list[np.ndarray]]:
-    """Return the views whose camera others confirm, their pictures, and z-depth (H, W) where several agree, NaN elsewhere."""
+class _Depths(NamedTuple):
+    """z-depth (H, W) of each photograph, NaN = unknown, in the unit of the cameras.
+
+    Attributes:
+        used: where several agree on texture, or a flat region has it.
+        trusted: where several agree on texture.
+        confirmed: share of the pixels of each photograph on which several agree.
+    """
+
+    used: list[np.ndarray]
+    trusted: list[np.ndarray]
+    confirmed: list[float]
+
+
+def _depths(job: Job, sparse: Sparse, root: Path) -> tuple[Sparse, list[Picture], _Depths]:
+    """Return the views whose camera others confirm, their pictures and their depth."""
     source = job.settings.source
     count = len(sparse.names)
     pictures = []
     for view in range(count):
         pictures.append(picture_of(root, sparse, view, source.detail, source.colour))
         job.progress(view + 1, count, "photographs reduced")
-    beside = neighbours(sparse.point, sparse.view, sparse.points, np.array([p.centre for p in pictures]))
+    beside = neighbours(sparse.point, sparse.view, sparse.points, np.array([p.centre for p in pictures]), ASKED)
 
     def depth_of(view: int) -> np.ndarray:
         if len(beside[view]) < AGREE:
@@ -110,14 +137,16 @@ def _depths(job: Job, sparse: Sparse, root: Path) -> tuple[Sparse, list[Picture]
         camera = sparse.camera_from_world[view]
         z = (sparse.points[sparse.point[sparse.view == view]] @ camera[:, :3].T + camera[:, 3])[:, 2]
         near = max(NEAREST * float(np.quantile(z, 0.02)), LEAST_OF_MEDIAN * float(np.median(z)))
-        return swept_depth(pictures[view], [pictures[i] for i in beside[view]], near, FARTHEST * float(np.quantile(z, 0.99)))
+        far = FARTHEST * float(np.quantile(z, 0.99))
+        return swept_depth(pictures[view], [pictures[i] for i in beside[view][:SWEPT]], near, far)
 
     swept = []
     for view, depth in enumerate(map_in_order(depth_of, count, job.threads)):
         swept.append(depth)
         job.progress(view + 1, count, "depth maps")
     depths = [
-        agreed(swept[view], pictures[view], [(swept[i], pictures[i]) for i in beside[view]], least=AGREE) for view in range(count)
+        agreed(swept[view], pictures[view], [(swept[i], pictures[i]) for i in beside[view][:SWEPT]], least=AGREE)
+        for view in range(count)
     ]
     share = np.array([np.isfinite(depth).mean() for depth in depths])
     if share.mean() < LEAST_CONFIRMED:
@@ -128,8 +157,35 @@ def _depths(job: Job, sparse: Sparse, root: Path) -> tuple[Sparse, list[Picture]
         )
     gone = np.flatnonzero((share < DOUBTFUL * np.median(share)) | (share == 0))
     kept = np.setdiff1d(np.arange(count), gone)
+    trusted = [np.where(textured(picture.grey), z, np.nan) for picture, z in zip(pictures, depths, strict=True)]
+    used = _filled(job, pictures, trusted, [[i for i in own if i not in gone] for own in beside])
     why = "others hardly confirm its depth: its camera may be placed wrongly (repeated patterns), or it shows plain walls"
-    return sparse.without(gone, why), [pictures[i] for i in kept], [depths[i] for i in kept]
+    of_kept = _Depths([used[i] for i in kept], [trusted[i] for i in kept], [float(share[i]) for i in kept])
+    return sparse.without(gone, why), [pictures[i] for i in kept], of_kept
+
+
+def _filled(job: Job, pictures: list[Picture], trusted: list[np.ndarray], beside: list[list[int]]) -> list[np.ndarray]:
+    """Return the depths (H, W) of pixels with texture and of flat regions, without what other photographs look through.
+
+    Args:
+        trusted: where several agree on texture, NaN elsewhere.
+        beside: of each view, those that are asked.
+    """
+    count = len(trusted)
+
+    def merged_of(view: int) -> np.ndarray:
+        own, flat = trusted[view], flat_depth(pictures[view].grey, trusted[view])
+        with np.errstate(invalid="ignore"):
+            is_flat = np.isfinite(flat) & (np.isnan(own) | (np.abs(flat / own - 1) < NEAR_FLAT))
+        return np.where(is_flat, flat, own)
+
+    def kept_of(view: int) -> np.ndarray:
+        same, through = votes(merged[view], pictures[view], [(merged[i], trusted[i], pictures[i]) for i in beside[view]])
+        enough = np.isfinite(trusted[view]) | (same > 0)
+        return np.where(enough & (same >= FOR_EACH_AGAINST * through), merged[view], np.nan).astype(np.float32)
+
+    merged = list(map_in_order(merged_of, count, job.threads))
+    return list(map_in_order(kept_of, count, job.threads))
 
 
 def _metres(source: Any, frame: RoomFrame, sparse: Sparse) -> tuple[float, str]:
@@ -151,7 +207,14 @@ def _metres(source: Any, frame: RoomFrame, sparse: Sparse) -> tuple[float, str]:
 
 
 def _facts(
-    sparse: Sparse, frame: RoomFrame, scale: float, basis: str, walls: Walls, faces: int, voxel: float, shares: list[float]
+    sparse: Sparse,
+    frame: RoomFrame,
+    scale: float,
+    basis: str,
+    walls: Walls,
+    faces: int,
+    voxel: float,
+    shares: dict[str, list[float]],
 ) -> dict[str, Any]:
     area, count = face_geometry(walls.vertices, walls.faces)[1], len(walls.error)
     found, built = (np.bincount(walls.side[own], area[own], count) for own in (walls.found, ~walls.found))
@@ -166,14 +229,16 @@ def _facts(
         for i in range(count)
     ]
     known = walls.error[np.isfinite(walls.error)]
+    tall = walls.height() or (frame.ceiling - frame.floor) * scale
     notes = [
         f"cameras and mesh were found from the photographs: {len(sparse.names)} have a camera, {faces} faces, voxels of"
-        f" {1000 * voxel:.3g} mm; depth that several confirm on {np.mean(shares):.0%} of the pixels",
+        f" {1000 * voxel:.3g} mm; depth that several confirm on {np.mean(shares['depth_share']):.0%} of the pixels, on"
+        f" {np.mean(shares['used_share']):.0%} with regions of one colour that are taken for flat, and without outlines",
         f"flat sides, floor and ceiling included, take the place of {found.sum():.3g} m2 of surface"
         + (f" that lies within {1000 * known.max():.2g} mm of them (standard deviation)" if len(known) else "")
         + f", and {built.sum():.3g} m2 are built where photographs show no texture",
         {
-            "room_height": f"scale: the room is {(frame.ceiling - frame.floor) * scale:.3g} m high (source.room_height)",
+            "room_height": f"scale: the room is {tall:.3g} m high (source.room_height)",
             "camera_height": "scale: guessed, from cameras that are held at source.camera_height above the "
             + ("floor" if frame.has_floor else "lowest surface, because no floor was found")
             + ("; source.room_height, from floor to ceiling, is better" if frame.has_floor and frame.has_ceiling else ""),
@@ -198,9 +263,9 @@ def _facts(
         "left_out": sparse.left_out,
         "points": len(sparse.points),
         "scale": {"metres_per_unit": scale, "from": basis},
-        "room_height_m": round((frame.ceiling - frame.floor) * scale, 3),
+        "room_height_m": round(tall, 3),
         "voxel_m": voxel,
-        "depth_share": [round(share, 4) for share in shares],
+        **{name: [round(share, 4) for share in values] for name, values in shares.items()},
         "planes": planes,
         "notes": notes,
     }
