@@ -14,6 +14,9 @@ UPRIGHT = float(np.cos(np.radians(25.0)))
 """Cosine of the largest angle between the vertical of the surface and that of the cameras."""
 LEVEL = 0.9
 """Cosine with the vertical from which a face is level."""
+TURNED = 0.05
+"""Second eigenvalue, of three that add up to 1, of the directions to the right of the pictures, from which on they tell the
+vertical."""
 BESIDE_FLOOR = 0.03
 """Share of the height of the room by which faces of the floor lie apart."""
 NOISE = 0.005
@@ -43,8 +46,8 @@ class RoomFrame(NamedTuple):
 def room_frame(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLike) -> RoomFrame:
     """Find the vertical, the direction of the walls, and the heights of floor and ceiling.
 
-    The vertical is the direction that most surface faces of those near the mean vertical of the cameras; without one, it is that
-    of the cameras. Floor and ceiling are the heights where most of the level surface lies near the ends.
+    The vertical is the direction that most surface faces of those near the vertical of the cameras; without one, it is that of
+    the cameras. Floor and ceiling are the heights where most of the level surface lies near the ends.
 
     Args:
         vertices, faces: (n, 3) and (m, 3), in any unit.
@@ -52,12 +55,11 @@ def room_frame(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLi
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
     normal, area = face_geometry(vertices, faces)
-    up = -np.asarray(world_from_camera, np.float64)[:, :3, 1].mean(0)
-    up /= max(float(np.linalg.norm(up)), 1e-12)
+    up = upright(world_from_camera)
     found = directions(normal, area)
-    upright = found[np.abs(found @ up) >= UPRIGHT]
-    if len(upright):  # the largest: cameras that look down lean
-        up = upright[0] * np.sign(upright[0] @ up)
+    level = found[np.abs(found @ up) >= UPRIGHT]
+    if len(level):  # the largest
+        up = level[0] * np.sign(level[0] @ up)
     middle = vertices[faces].mean(1)
 
     # -------- the floor tells the vertical best --------
@@ -67,11 +69,25 @@ def room_frame(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLi
     up, _ = fitted_plane(up, level & (np.abs(middle @ up - floor) <= beside), middle, normal, area, beside)
 
     # -------- walls: the largest direction that is square to it --------
-    upright = found[np.abs(found @ up) < np.sqrt(1 - UPRIGHT**2)]
-    along = upright[0] if len(upright) else np.eye(3)[np.abs(up).argmin()]
+    across = found[np.abs(found @ up) < np.sqrt(1 - UPRIGHT**2)]
+    along = across[0] if len(across) else np.eye(3)[np.abs(up).argmin()]
     along = along - (along @ up) * up
     along /= np.linalg.norm(along)
     return RoomFrame(np.stack([along, np.cross(up, along), up]), *_ends(middle @ up, area, np.abs(normal @ up) > LEVEL))
+
+
+def upright(world_from_camera: ArrayLike) -> NDArray:
+    """Return the vertical (3,) of cameras that nobody rolls: square to what lies to the right in their pictures, also where all
+    of them look down; of cameras that all look the same way, the mean of what is up in their pictures.
+
+    world_from_camera: (v, 3 or 4, 4) poses, OpenCV axes.
+    """
+    poses = np.asarray(world_from_camera, np.float64)
+    up, right = -poses[:, :3, 1].mean(0), poses[:, :3, 0]
+    share, axes = np.linalg.eigh(right.T @ right / len(right))
+    if share[1] >= TURNED:
+        up = axes[:, 0] * (1.0 if axes[:, 0] @ up >= 0 else -1.0)
+    return up / max(float(np.linalg.norm(up)), 1e-12)
 
 
 def _ends(height: NDArray, area: NDArray, level: NDArray) -> tuple[float, float, bool, bool]:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from iif_core.reconstruction.agreement import agreed, votes
 from iif_core.reconstruction.flat import flat_depth, textured
-from iif_core.reconstruction.frame import room_frame
+from iif_core.reconstruction.frame import room_frame, upright
 from iif_core.reconstruction.fusing import fused_mesh, large_pieces
 from iif_core.reconstruction.neighbours import neighbours
 from iif_core.reconstruction.sweep import Picture, SweepOptions, _add_path, swept_depth
@@ -399,6 +399,17 @@ def test_cameras_that_all_look_down_the_same_way_do_not_tilt_the_floor():
     assert 10 < np.degrees(np.arccos(up[2] / np.linalg.norm(up))) < 20
     frame = room_frame(np.concatenate([vertices, board]), every, poses)
     assert frame.turn[2, 2] > np.cos(np.radians(0.5))
+
+
+def test_the_vertical_of_cameras_that_look_down():
+    """They look down by 45 degrees, into a quarter of the room: what is up in their pictures leans, what is right does not."""
+    eyes = [(x, -1.5, 1.0) for x in (-1.0, 0.0, 1.0)]
+    poses = np.array([np.linalg.inv(np.vstack([looking(eye, (0.0, -0.3, -0.4)), [0, 0, 0, 1]])) for eye in eyes])
+    up = -poses[:, :3, 1].mean(0)
+    assert np.degrees(np.arccos(up[2] / np.linalg.norm(up))) > 35
+    assert upright(poses)[2] > 0.9999
+    same = np.repeat(poses[1:2], 3, 0)  # one direction tells no more than its picture
+    np.testing.assert_allclose(upright(same), -same[0, :3, 1])
 
 
 @pytest.mark.parametrize("seed", range(3))
