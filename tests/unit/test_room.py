@@ -11,11 +11,13 @@ import pytest
 from PIL import Image
 
 from iif_core.light.base_scene import BaseScene
+from iif_core.light.environment import solid_angles
 from iif_core.light.light_maps import to_half
+from iif_core.numerics.color import luminance
 from tests.unit.transport_rooms import box, quad
 from workflow.exporters.atlas import UNKNOWN, Atlas, TexturedPart
 from workflow.room import build
-from workflow.room.light import find_lamps, lit_texels, trace_lamps
+from workflow.room.light import backdrop, find_lamps, lit_texels, trace_lamps
 from workflow.room.pack import array_blob, normals_to_bytes, quantized
 from workflow.room.page import NOTES, Page, policy, render_page, three_version
 from workflow.room.sources import LIBRARY, VENDORED, VIEWER
@@ -90,6 +92,19 @@ def test_every_emitter_is_a_lamp_up_to_sixteen():
     np.testing.assert_allclose(all_of_them.radiance[:6], radiance[:6])  # with their own colours
     np.testing.assert_array_equal(all_of_them.surroundings, sun)
     assert find_lamps([], np.zeros((0, 3)), np.zeros(3)).lamps == []
+
+
+def test_what_no_photograph_shows_outside_is_grey():
+    sky = np.random.default_rng(0).uniform(0.1, 2.0, (4, 8, 3)).astype(np.float32)
+    seen = np.zeros((4, 8), bool)
+    seen[1, 2:5] = True
+    found = backdrop(sky, seen)
+    np.testing.assert_array_equal(found[seen], sky[seen])
+    grey = np.unique(found[~seen])
+    weights = solid_angles(4, 8)[~seen]
+    assert len(grey) == 1 and grey[0] == pytest.approx((luminance(sky[~seen]) * weights).sum() / weights.sum())
+    for all_of_it in (None, np.ones((4, 8), bool), np.zeros((1, 1), bool)):  # known, or one radiance for all directions
+        assert backdrop(sky, all_of_it) is sky
 
 
 def test_texels_lie_on_the_surface(parts):

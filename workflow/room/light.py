@@ -11,7 +11,7 @@ import numpy as np
 from iif_core.light.base_scene import BaseScene
 from iif_core.light.environment import as_map, solid_angles
 from iif_core.light.light_maps import MOST_LAMPS, NORMAL_REACH, group_lamps, smooth, with_mean_of
-from iif_core.numerics.color import id_colours
+from iif_core.numerics.color import id_colours, luminance
 from iif_core.surface.atlas import nearest_covered
 from iif_core.surface.triangles import face_geometry
 from workflow.exporters.atlas import TexturedPart, joined, texels_beside, texels_of
@@ -115,6 +115,18 @@ def find_lamps(parts: Sequence[TexturedPart], radiance: Array, environment: Arra
         lamps.append(Lamp("light from outside", (), _color(mean) if even else np.ones(3), mean, 0.0))
         outside = np.full_like(outside, outside.max()) if even else outside
     return Lamps(lamps, of_emitter, traced.astype(np.float32), len(lamps) - 1 if shines else -1, outside)
+
+
+def backdrop(radiance: Array, seen: Array | None) -> Array:
+    """Return what is drawn behind the room: an environment (H, W, 3), grey with the mean luminance of those texels that no
+    photograph shows. Their colours light the room, but as a picture they would be patches of nothing.
+
+    seen: (H, W) bool; None = all.
+    """
+    if seen is None or seen.shape != radiance.shape[:2] or seen.all():
+        return radiance
+    mean = np.average(luminance(radiance[~seen]), weights=solid_angles(*seen.shape)[~seen])
+    return np.where(seen[..., None], radiance, np.float32(mean))
 
 
 def _color(radiance: Array) -> Array:

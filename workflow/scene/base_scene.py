@@ -117,6 +117,19 @@ def _environment(reader: StageReader, emitters: dict[str, np.ndarray], rows: np.
     return out
 
 
+def read_environment_seen(job: Job) -> np.ndarray | None:
+    """Return (H, W) bool, the texels of the environment of which a photograph shows something; None where it has no texels. The
+    job needs emission upstream."""
+    reader = job.read("emission")
+    if not reader.has("environment_texels.parquet"):
+        return None
+    texels, emitters = reader.table("environment_texels.parquet"), reader.table("emitters.parquet")
+    seen = emitters["emitter_id"][(emitters["kind"] == "environment") & (emitters["observations"] > 0)]
+    out = np.zeros([int(texels[c].max(initial=0)) + 1 for c in ("row", "column")], bool)
+    out[texels["row"], texels["column"]] = np.isin(texels["emitter_id"], seen)
+    return out
+
+
 def read_object_gains(job: Job, n_objects: int) -> np.ndarray:
     """Read the factors (n_objects, 3) on the base albedo that belong to the estimated light; the job needs emission upstream."""
     table = job.read("emission").table("object_gains.parquet")

@@ -13,11 +13,12 @@ from workflow.exporters.joining import joined
 from workflow.models.denoise import require_denoiser
 from workflow.room import build
 from workflow.room.contents import brightest, facts_of_objects, facts_of_part, page_that_fits, radiance_of_emitters
-from workflow.room.light import find_lamps, lit_texels, trace_lamps
+from workflow.room.light import backdrop, find_lamps, lit_texels, trace_lamps
 from workflow.room.pack import array_blob
 from workflow.room.page import NOTES
 from workflow.room.unlit import unlit_picture
 from workflow.runtime.job import Job
+from workflow.scene.base_scene import read_environment_seen
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import read_recovered
 
@@ -84,7 +85,8 @@ def run(job: Job) -> None:
         "environment": None,
     }
     if lamps.environment >= 0:
-        surroundings = to_half(lamps.surroundings.reshape(-1, 1, 3))
+        behind = backdrop(lamps.surroundings, read_environment_seen(job))
+        surroundings = to_half(behind.reshape(-1, 1, 3))
         blobs["environment"] = array_blob(surroundings.value[:, 0].view(np.uint16))
         shape = list(lamps.surroundings.shape[:2])
         document["environment"] = {"lamp": lamps.environment, "shape": shape, "scale": float(surroundings.scale[0])}
