@@ -31,7 +31,7 @@ BEHIND = 0.02
 OVERLAP = 0.2
 """How far (m) they overlap."""
 CLOSES = 0.5
-"""Share of the sides that must be planes for those at the extent to be built: they close a room, and do not make one up."""
+"""Sides at the extent are built if more than this share of the sides are planes: they close a room, and do not make one up."""
 LAYERS = ((0.03, 0.25, 45.0), (0.01, 0.05, 0.25))
 """Of two searches, the second about what the first finds: thickness (m) of the layers by which the direction of the walls is
 told, steps (degrees) in which it is looked for, and how far to either side."""
@@ -92,7 +92,7 @@ def flat_walls(
     The planes are those of `enclosure`; along the axes of the room a little surface is enough, such as a picture or a door on a
     wall without texture. A square of a plane is built unless depth maps show something behind it, as through a
     door. Where a plane prolongs surface of the mesh, it takes the place of the surface that lies on it. Planes at the extent
-    close what is left, if at least half of the sides are planes: there squares are built where no surface is near, and go on a
+    close what is left, if more than half of the sides are planes: there squares are built where no surface is near, and go on a
     little behind the surface at their border.
 
     Args:
@@ -121,7 +121,7 @@ def flat_walls(
     rest = faces[~flat]
     near = ~of_plane
     near[near] = _distance(vertices, rest, middle[near]) <= NEAR
-    kept &= of_plane | (is_plane.mean() >= CLOSES)
+    kept &= of_plane | (is_plane.mean() > CLOSES)
     kept &= ~near
     edge = np.linalg.norm(corners[quads[0, 1]] - corners[quads[0, 0]])
     for _ in range(max(1, round(OVERLAP / edge))):

@@ -244,7 +244,7 @@ def _facts(
             + ("; source.room_height, from floor to ceiling, is better" if frame.has_floor and frame.has_ceiling else ""),
         }[basis],
     ]
-    if len(known) < CLOSES * count:
+    if len(known) <= CLOSES * count:
         notes.append(
             f"WARNING the room stays open: flat surface was found on {len(known)} of its {count} sides; show walls and ceiling"
             " too, from several places"
