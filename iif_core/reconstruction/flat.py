@@ -59,7 +59,7 @@ def textured(grey: NDArray) -> NDArray:
 
 
 def flat_depth(grey: NDArray, depth: NDArray, options: FlatOptions = FlatOptions()) -> NDArray:
-    """Return the z-depth (H, W) float32 of the planes of regions of one grey value, NaN where there is none.
+    """Return the z-depth (H, W) float32 of the planes of regions of one grey value, NaN where there is none (Eq. D.4).
 
     The inverse depth of a plane is linear in the pixel. Of each region, the coefficients minimise
 

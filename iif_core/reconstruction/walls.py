@@ -143,7 +143,7 @@ def flat_walls(
 def room_axes(middle: NDArray, normal: NDArray, area: NDArray) -> NDArray:
     """Return axes (3, 3) of a room with z up: x and y along the walls, where upright surface lies in the thinnest layers,
 
-    argmax over phi of sum_b h_b(phi)^2 + sum_b h'_b(phi)^2 (docs/method/reconstruction.md, Eq. D.4),
+    argmax over phi of sum_b h_b(phi)^2 + sum_b h'_b(phi)^2 (docs/method/reconstruction.md, Eq. D.5),
 
     with the area h_b, h'_b in layers along both axes (`LAYERS`). Normals alone are off by degrees on noisy surface.
 
