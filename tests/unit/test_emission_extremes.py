@@ -8,7 +8,7 @@ from iif_core.light.emission.direct import EmissionPrior, solve_emission, solve_
 from iif_core.light.emission.groups import group_emitters
 from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import assemble, initial_radiance, white_surface
-from iif_core.light.emission.pruning import prune_groups
+from iif_core.light.emission.pruning import _reason, prune_groups
 from iif_core.surface.segments import face_adjacency
 from tests.unit.emission_systems import rows_of, transport_of
 
@@ -124,3 +124,9 @@ def test_emitter_that_is_never_seen_is_left_to_its_light():
     out = prune_groups(trial.rows, EmissionPrior.independent(seen), np.arange(2), evidence, ~trial.anchor, np.zeros(2, bool))
     assert out.kept.all() and np.isinf(out.excess[1])
     np.testing.assert_allclose(out.radiance, truth, rtol=0.05)
+
+
+@pytest.mark.parametrize("excess, said", [(2.0, "50%"), (0.5, "200%"), (1e-12, "ten"), (0.0, "ten")])
+def test_reasons_are_numbers_that_people_read(excess, said):
+    reason = _reason(False, True, excess, 0.01)
+    assert said in reason and "0000" not in reason

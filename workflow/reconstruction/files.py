@@ -45,8 +45,8 @@ def overview_png(
         above.subplots(1, 2), ((0, 1), (0, 2)), ("from above", "from the side"), (~level, level | across), strict=True
     ):
         for own, colour, label in (
-            (walls.found, "tab:green", "flat side, in the place of surface"),
             (~walls.found, "tab:orange", "flat side where nothing was found"),
+            (walls.found, "tab:green", "flat side, in the place of surface"),
         ):
             axes.plot(middle[cut & own, i], middle[cut & own, j], ".", ms=1.5, color=colour, alpha=0.4, label=label)
         axes.plot(dots[:, i], dots[:, j], ",", color="0.4", label="surface that photographs show")

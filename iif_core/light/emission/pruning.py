@@ -161,7 +161,8 @@ def _reason(dark: bool, reflecting: bool, excess: float, power: float) -> str:
     if dark:
         return "no emission is left for it"
     if reflecting:
-        return f"reflects: a white surface in its place would have {1 / max(excess, 1e-9):.0%} of its brightness"
+        white = f"{1 / excess:.0%} of" if excess > 0.1 else "more than ten times"
+        return f"reflects: a white surface in its place would have {white} its brightness"
     return f"{power:.2%} of the light, and not missed"
 
 
