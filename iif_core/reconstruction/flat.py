@@ -51,10 +51,8 @@ class FlatOptions:
 def textured(grey: NDArray) -> NDArray:
     """Return (H, W) bool: the pixels of a photograph (H, W) that have texture themselves. Without it a window is matched by what
     else is in it, and its depth is that of the nearest outline."""
-    square = np.asarray(grey, np.float64)
-    own, window = (
-        np.sqrt(np.maximum(uniform_filter(square**2, size) - uniform_filter(square, size) ** 2, 0.0)) for size in (3, 7)
-    )
+    grey = np.asarray(grey, np.float64)
+    own, window = (np.sqrt(np.maximum(uniform_filter(grey**2, size) - uniform_filter(grey, size) ** 2, 0.0)) for size in (3, 7))
     return (own >= LEAST_TEXTURE) & (own >= OWN_TEXTURE * window)
 
 
