@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from workflow.decisions import materials
 from workflow.report import calibration, wording
+from workflow.report.emitters import lamp_power
 from workflow.report.evidence import BRIGHT, SHOWN, doubtful_area
 from workflow.report.verdict import AMBER, GREEN, LIGHT_OF, LIMITS, MEANS, ORDER, RED, Evidence, judge, limits_table
 
@@ -74,7 +75,10 @@ def test_a_mesh_that_only_its_own_photographs_judge_is_never_good():
 
 
 def test_lamps_that_are_more_likely_surface_light_no_room():
-    assert changed(unlikely=2)["light"] == GREEN  # one is left
+    assert changed(unlikely=2, unlikely_power=0.1)["light"] == GREEN  # one is left, and has most of the light
+    assert changed(unlikely=2, unlikely_power=0.9)["light"] == AMBER
+    said = judge(dataclasses.replace(GOOD, unlikely=2, unlikely_power=0.1)).lights[1].shown
+    assert any("2 of them" in finding.text and "10 %" in finding.text for finding in said)
     assert changed(unlikely=3)["light"] == RED
     assert changed(unlikely=3, environment=True)["light"] == AMBER
     assert changed(unlikely=3, environment=True, escape=0.5)["light"] == RED
@@ -109,6 +113,7 @@ def test_nothing_known_is_never_green():
         ("escape", "geometry", RED), ("depth", "geometry", RED), ("agreement", "geometry", RED),
         ("photographed", "geometry", RED),
         ("misfit", "light", RED), ("doubtful_area", "light", AMBER), ("light_spread", "light", RED), ("albedo", "materials", RED),
+        ("unlikely_power", "light", AMBER),
         ("roughness", "materials", RED), ("metallic", "materials", RED), ("uncertainty", "materials", RED),
         ("unfitted", "materials", RED), ("stability", "materials", AMBER), ("level_error", "scale", RED),
         ("raised", "scale", RED), ("light_scale", "scale", RED), ("discrepancy", "scale", RED),
@@ -303,3 +308,11 @@ def test_terms_and_numbers_are_written_for_people():
         "0",
     ]
     assert wording.prose("`filmic` <b> 0.0% +- 3") == "<code>filmic</code> &lt;b&gt; 0.0\u00a0% ± 3"
+
+
+def test_power_of_lamps_counts_both_sides_and_what_was_kept():
+    table = {
+        "kind": np.array(["area", "area", "area", "environment"]), "kept": np.array([1, 1, 0, 1]), "side": np.array([1, 0, 0, 1]),
+        "area_m2": np.array([0.5, 0.5, 9.0, 0.0]), **{f"radiance_{c}": np.array([2.0, 4.0, 8.0, 1.0]) for c in "rgb"},
+    }  # fmt: skip
+    assert lamp_power(table).tolist() == [3.0, 12.0, 0.0, 0.0]

@@ -11,12 +11,18 @@ from iif_core.numerics import color
 from workflow.report.wording import percent, significant
 
 
+def lamp_power(table: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return (n,) what each emitter of emitters.parquet sends out, summed over channels, up to one factor; 0 of those that are no
+    kept area lamps."""
+    radiance = sum(table[f"radiance_{c}"].astype(np.float64) for c in "rgb")
+    is_lamp = table["kept"].astype(bool) & (table["kind"] == "area")
+    return np.where(is_lamp, table["area_m2"] * np.where(table["side"] == 0, 2.0, 1.0), 0) * radiance
+
+
 def emitter_rows(table: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
     """Return the rows of emitters.parquet of stage export as texts; the most powerful lamp first."""
     radiance, error = (np.stack([table[f"{of}_{c}"] for c in "rgb"], 1).astype(np.float64) for of in ("radiance", "error"))
-    kept, area = table["kept"].astype(bool), table["kind"] == "area"
-    sides = np.where(table["side"] == 0, 2.0, 1.0)
-    power = np.where(kept & area, table["area_m2"] * sides, 0) * radiance.sum(1)
+    kept, area, power = table["kept"].astype(bool), table["kind"] == "area", lamp_power(table)
     probability, rows = table.get("probability", np.full(len(power), -1.0)), []
     for i in np.argsort(-power, kind="stable"):
         peak = radiance[i].max()

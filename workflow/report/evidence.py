@@ -8,6 +8,7 @@ import numpy as np
 
 from iif_core.light.emission.options import EmissionOptions
 from workflow.decisions import numerics
+from workflow.report.emitters import lamp_power
 from workflow.report.reported import Reported
 from workflow.report.scores import found
 from workflow.report.verdict import Evidence
@@ -42,6 +43,7 @@ def evidence_of(scene: Reported) -> Evidence:
     fitted = scene.readers["affines"]
     lamps = emitters["kept"].astype(bool) & (emitters["kind"] == "area")
     probability = emitters.get("probability", np.full(len(lamps), -1.0))
+    unlikely, power = lamps & (probability >= 0) & (probability < LIKELY), lamp_power(emitters)
     alone = scene.document("reconstruction") if "reconstruction" in scene.readers else {}
     unplaced = len(alone.get("left_out", ()))
     scored = psnr_of_views(scene.readers["metrics"].table("metrics.parquet"))
@@ -72,7 +74,8 @@ def evidence_of(scene: Reported) -> Evidence:
         photographed=float(cache[-1]) if cache else scene.document("plan").get("probes", {}).get("photographed_share"),
         stability=scene.document("segmentation").get("stability"),
         lamps=int(np.count_nonzero(lamps)),
-        unlikely=int(np.count_nonzero(lamps & (probability >= 0) & (probability < LIKELY))),
+        unlikely=int(np.count_nonzero(unlikely)),
+        unlikely_power=float(power[unlikely].sum() / max(power[lamps].sum(), 1e-300)),
         environment=bool(np.any(recovered.light.environment)),
         doubtful_area=doubtful_area(light.table("emitters.parquet"), light.table("radiance_cache.parquet"), density),
         misfit=emission.get("misfit"),

@@ -53,6 +53,7 @@ LIMITS: dict[str, Limit] = {
     "stability": Limit(0.7, 0.3, "adjusted Rand index of the objects under small changes; the plan's own limit is 0.7"),
     "misfit": Limit(0.05, 0.4, "mean squared relative error of the light: good captures have 0.01 to 0.04; 0.4 is 60 %"),
     "doubtful_area": Limit(0.5, 2.0, "m^2 taken for lamps that hardly outshine the room, or are hardly photographed"),
+    "unlikely_power": Limit(0.5, 1.0, "share of the lamps' power from those more likely surface: beyond a half, no lamp may be right"),
     "light_spread": Limit(0.1, 0.3, "spread of the light's error over objects, by the truth, as a logarithm: 10 % and 35 %"),
     "rerendering": Limit(20.0, 16.0, "dB: 20 is an error of 10 % of the sensor's range, 16 is one of 16 %"),
     "albedo": Limit(20.0, 14.0, "dB against the truth: 20 is an error of 0.1; one grey for a whole room reaches 10 to 12"),
@@ -69,7 +70,7 @@ LIMITS: dict[str, Limit] = {
 
 LIGHT_OF = {
     **dict.fromkeys(("escape", "depth", "edges", "agreement", "lost", "photographed"), "geometry"),
-    **dict.fromkeys(("misfit", "doubtful_area", "light_spread"), "light"),
+    **dict.fromkeys(("misfit", "doubtful_area", "unlikely_power", "light_spread"), "light"),
     **dict.fromkeys(("stability", "rerendering", "albedo", "roughness", "metallic"), "materials"),
     **dict.fromkeys(("uncertainty", "unfitted"), "materials"),
     **dict.fromkeys(("level_error", "raised", "light_scale", "discrepancy"), "scale"),
@@ -121,7 +122,8 @@ class Evidence:
         photographs: number of photographs; lost: how many were left out of those given.
         photographed: share of the surface met by rays from surface that photographs show.
         stability: of the objects; None also where objects are given.
-        lamps: emitters that were kept; unlikely: how many of them are more likely surface that reflects.
+        lamps: emitters that were kept; unlikely: how many of them are more likely surface that reflects; unlikely_power: their share
+            of the power of all of them.
         environment: whether light from outside was found.
         doubtful_area: m^2 of what was taken for lamps without clear evidence (`evidence.doubtful_area`).
         misfit: of the light; light_spread: of the light against the truth.
@@ -154,6 +156,7 @@ class Evidence:
     stability: float | None = None
     lamps: int = 0
     unlikely: int = 0
+    unlikely_power: float = 0.0
     environment: bool = False
     doubtful_area: float | None = None
     misfit: float | None = None
@@ -417,11 +420,16 @@ def _light(e: Evidence) -> Light:
     counted = f"{e.lamps} {'lamp' if e.lamps == 1 else 'lamps'} found"
     if e.lamps == e.unlikely > 0:
         counted += ", each more likely bright surface"
+    elif e.unlikely:
+        one = "one of them is" if e.unlikely == 1 else f"{e.unlikely} of them are"
+        counted += f"; {one} more likely bright surface, with {percent(e.unlikely_power)} of their power"
+    look = "Look at the list of lamps below, and photograph each lamp and window from several sides"
     if e.lamps > e.unlikely:
-        lamps = Finding(GREEN, f"{counted}{' and ' + outside if outside else ''}")
+        level = min(LIMITS["unlikely_power"].level(e.unlikely_power), AMBER, key=ORDER.index)
+        also = f"{';' if e.unlikely else ' and'} {outside}{' lights the room too' if e.unlikely else ''}" if outside else ""
+        lamps = Finding(level, f"{counted}{also}", "" if level == GREEN else look)
     elif e.environment and e.escape is not None and LIMITS["escape"].level(e.escape) == GREEN:
-        doubt = Finding(AMBER, counted, "Look at the list of lamps below, and photograph each lamp and window from several sides")
-        lamps = doubt if e.lamps else Finding(GREEN, f"{counted}; {outside} lights the room")
+        lamps = Finding(AMBER, counted, look) if e.lamps else Finding(GREEN, f"{counted}; {outside} lights the room")
     elif e.environment:
         lamps = Finding(
             LIMITS["escape"].level(e.escape) if e.escape is not None else AMBER,
