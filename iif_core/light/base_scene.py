@@ -27,6 +27,7 @@ class BaseScene:
             texture.
         object_values: (n_objects, 5) means, for surface that no photograph shows.
         transmittance: (n_objects,) share of the light that passes straight through the surface of each object; None = none.
+        made_up: (n_objects,) bool, objects that were built around a scan, where light may come in; None = none.
     """
 
     vertices: np.ndarray
@@ -42,6 +43,7 @@ class BaseScene:
     cell_values: np.ndarray
     object_values: np.ndarray
     transmittance: np.ndarray | None = None
+    made_up: np.ndarray | None = None
 
     @property
     def is_sheer(self) -> np.ndarray:

@@ -1,8 +1,10 @@
 """The mesh of a room as a point sees it."""
 
 import numpy as np
+import pytest
 
 from iif_core.light.base_scene import BaseScene
+from workflow.scene.base_scene import made_up_objects
 from workflow.scene.fitted_maps import without_emitters
 
 
@@ -25,6 +27,13 @@ def test_normals_are_on_the_side_of_the_eye():
     seen = scene.seen_normals(np.array([[0, 1, -1]]), np.array([0, 0, 3.0]))
     assert seen.dtype == np.float32 and seen.tolist() == [[[0, 0, 1], [0, 0, 1], [0, 0, 0]]]
     assert scene.seen_normals(np.array([[0]]), np.zeros(3)).tolist() == [[[0, 0, -1]]]
+
+
+@pytest.mark.parametrize("added, expected", [(0, [0, 0, 0]), (1, [0, 0, 1]), (2, [0, 0, 1]), (3, [0, 1, 1]), (4, [0, 1, 1])])
+def test_objects_are_made_up_if_all_their_faces_were_added(added, expected):
+    object_id = np.int32([0, 0, 1, -1, 2])
+    assert made_up_objects(object_id, 3, added).tolist() == [bool(one) for one in expected]
+    assert not made_up_objects(np.int32([0, 1, 0]), 2, 1).any()  # a scan has faces of the object too
 
 
 def test_emitters_are_black_and_rough_in_the_fitted_maps():

@@ -131,6 +131,12 @@ def test_unseen_surface_is_unlikely_unless_it_is_overhead(closed):
     assert (np.delete(odds.odds, [*hidden]) == 1.0).all()
 
 
+def test_what_was_built_around_a_scan_is_likely_wherever_it_is(closed):
+    made_up = np.isin(np.arange(closed.scene.n_objects), [_number(closed, "bulb"), _number(closed, "wall_a")])
+    photos = replace(closed, scene=replace(closed.scene, made_up=made_up))
+    assert LampOdds.of(photos, ObjectLooks.of(photos, 0.5)).is_likely.tolist() == made_up.tolist()
+
+
 @pytest.mark.parametrize(
     "pixels, bounded, is_saturated", [(10, 9, True), (10, 8, False), (4, 4, True), (3, 3, False), (0, 0, False)]
 )

@@ -54,7 +54,7 @@ def test_what_is_read_decides_where_specular_light_is_traced_and_how_noisy_diffu
         ("source: {kind: photographs, path: a, room_height: 2.6 m}", ["source.room_height", "'2.6 m'", "2.6"]),
         ("source: {kind: photographs, path: a, room_height: 260}", ["source.room_height", 260, "metres"]),
         ("source: {kind: folder, path: a, room_height: 2.6}", ["source.room_height", "`kind: photographs`"]),
-        ("source: {kind: folder, path: a}\ncapture: {exposure: auto}", ["capture.exposure", "'auto'", "'estimate'"]),
+        ("source: {kind: folder, path: a}\ncapture: {exposure: automatic}", ["capture.exposure", "'automatic'", "'auto'"]),
     ],
 )
 def test_what_people_write_is_told_in_the_form_that_works(scene, text, names):

@@ -53,7 +53,7 @@ LIMITS: dict[str, Limit] = {
     "stability": Limit(0.7, 0.3, "adjusted Rand index of the objects under small changes; the plan's own limit is 0.7"),
     "misfit": Limit(0.05, 0.4, "mean squared relative error of the light: good captures have 0.01 to 0.04; 0.4 is 60 %"),
     "doubtful_area": Limit(0.5, 2.0, "m^2 taken for lamps that hardly outshine the room, or are hardly photographed"),
-    "unlikely_power": Limit(0.5, 1.0, "share of the lamps' power from those more likely surface: beyond a half, no lamp may be right"),
+    "unlikely_power": Limit(0.5, 1.0, "share of the power of lamps in those that are more likely surface: most of the light"),
     "light_spread": Limit(0.1, 0.3, "spread of the light's error over objects, by the truth, as a logarithm: 10 % and 35 %"),
     "rerendering": Limit(20.0, 16.0, "dB: 20 is an error of 10 % of the sensor's range, 16 is one of 16 %"),
     "albedo": Limit(20.0, 14.0, "dB against the truth: 20 is an error of 0.1; one grey for a whole room reaches 10 to 12"),
@@ -122,8 +122,8 @@ class Evidence:
         photographs: number of photographs; lost: how many were left out of those given.
         photographed: share of the surface met by rays from surface that photographs show.
         stability: of the objects; None also where objects are given.
-        lamps: emitters that were kept; unlikely: how many of them are more likely surface that reflects; unlikely_power: their share
-            of the power of all of them.
+        lamps: emitters that were kept; unlikely: how many of them are more likely surface that reflects; unlikely_power: share
+            of the power of all lamps that these have.
         environment: whether light from outside was found.
         doubtful_area: m^2 of what was taken for lamps without clear evidence (`evidence.doubtful_area`).
         misfit: of the light; light_spread: of the light against the truth.

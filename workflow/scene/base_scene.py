@@ -46,6 +46,7 @@ def read_base_scene(job: Job) -> BaseScene:
     object_values[means["object_id"][seen]] = _rows(means)[seen]
     normals, areas = face_geometry(vertices, faces)
     return BaseScene(
+        made_up=made_up_objects(object_id, n_objects, int(capture.facts.get("added_faces", 0))),
         vertices=vertices,
         faces=faces,
         object_id=object_id,
@@ -59,6 +60,15 @@ def read_base_scene(job: Job) -> BaseScene:
         cell_values=_rows(cells),
         object_values=object_values,
     )
+
+
+def made_up_objects(object_id: np.ndarray, n_objects: int, added: int) -> np.ndarray:
+    """Return (n_objects,) bool, the objects of which all faces are among the `added` last ones, which the capture built around a
+    scan (`source.close`); `object_id`: (F,) of the faces."""
+    made_up = np.zeros(n_objects + 1, bool)  # the last entry is for faces without an object, -1
+    made_up[object_id[len(object_id) - added :]] = True
+    made_up[object_id[: len(object_id) - added]] = False
+    return made_up[:-1]
 
 
 def _rows(table: dict[str, np.ndarray]) -> np.ndarray:

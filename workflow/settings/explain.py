@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -10,7 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from workflow.intake.names import shown
-from workflow.settings.names import did_you_mean
+from workflow.settings.names import LONG, did_you_mean
 from workflow.settings.scene import POOLED, UNIONS, SceneSettings, section_in
 from workflow.settings.section import Section
 
@@ -38,7 +39,12 @@ BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 """Words for the limits of a number, by their names in pydantic's errors."""
 IN_METRES = ("source.room_height", "source.camera_height")
 """Lengths that people give in other units."""
-MEANT = {"capture.exposure": dict.fromkeys(("auto", "automatic"), "estimate"), "source.unit": {"meter": "m", "metre": "m"}}
+_UNITS = {
+    **{f"{by}{name}": f"{by[:1]}m" for by in ("", "centi", "milli", "kilo") for name in ("meter", "metre", "meters", "metres")},
+    **dict.fromkeys(("foot", "feet"), "ft"),
+    **dict.fromkeys(("inch", "inches"), "in"),
+}
+MEANT = {"capture.exposure": {"automatic": "auto"}, "source.unit": _UNITS}
 """Words that people try -> what they mean."""
 EXAMPLES = {"relight": "config/relight/kitchen.yaml"}
 """Files that show all of a section that config/scenes/kitchen.yaml does not have."""
@@ -109,7 +115,9 @@ def _one_of_each_choice(problems: Sequence[Any]) -> list[Any]:
             said = dict.fromkeys(
                 "it may also be `key: value` pairs" if p["type"] == "model_type" else needed(p) for p, _ in group
             )
-            inside = [{**group[0][0], "type": "any_of", "ctx": {}, "msg": "; ".join(said)}]
+            first, *others = said
+            others = [other if other.startswith("it may") else f"or {other.removeprefix('Needed: ')}" for other in others]
+            inside = [{**group[0][0], "type": "any_of", "ctx": {}, "msg": "; ".join([first, *others])}]
         kept.extend(inside)
     return kept
 
@@ -181,9 +189,7 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
             hint = f" It is `{RENAMED[dotted]}` now." if dotted in RENAMED else hint or _of_another_kind(where)
             lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
         elif kind in ("model_type", "model_attributes_type", "dict_type"):
-            lines.append(
-                f"{path}: `{dotted}`: found {shown(found)}, needed `key: value` pairs, e.g. {_example_of(where)}."
-            )
+            lines.append(f"{path}: `{dotted}`: found {shown(found)}, needed `key: value` pairs, e.g. {_example_of(where)}.")
         elif kind == "missing":
             example = EXAMPLES.get(str(where[0]), "config/scenes/kitchen.yaml")
             lines.append(f"{path}: `{dotted}`: missing. Add it; {example} is a complete example.")
@@ -206,7 +212,9 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
                 what += f" with a point, without a unit: {number[1]}.{number[2] or 0}"
             elif dotted in IN_METRES:
                 what += " (metres)"
-            other = MEANT.get(dotted, {}).get(found) if isinstance(found, str) else None
+            words = MEANT.get(dotted, {})
+            near = difflib.get_close_matches(found.lower(), words, 1) if isinstance(found, str) and len(found) < LONG else []
+            other = words[near[0]] if near else None
             hint = did_you_mean(found, re.findall(r"'([^']*)'", what)) if isinstance(found, str) else ""
             hint = f" Did you mean '{other}'?" if other else hint or (_in_metres(found) if dotted in IN_METRES else "")
             lines.append(f"{path}: `{dotted}`: found {said}. {what}.{hint}")

@@ -145,8 +145,9 @@ class Capture(Section):
     """Image width in pixels; existing photographs are reduced to fit width x height, with their aspect ratio kept."""
     height: int = Field(160, ge=16, le=8192)
     """Image height in pixels."""
-    exposure: Literal["given", "estimate"] = "given"
-    """`estimate`: find the exposures of the photographs from surface that several of them show."""
+    exposure: Literal["auto", "given", "estimate"] = "auto"
+    """`given`: exposures of `exposures.json` or the source, without them all alike. `estimate`: found from surface that several
+    photographs show. `auto`: given ones, without them those of 8-bit photographs estimated if they differ."""
     test_every: int = Field(0, ge=0)
     """Hold out every n-th view, or as many in stretches of a video: no stage before `render` and `metrics` reads its photograph
     (0 = none)."""

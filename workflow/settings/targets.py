@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
 from iif_core.errors import InputError
 from workflow.registry import STAGES
 from workflow.settings import batch_table
-from workflow.settings.names import did_you_mean, did_you_mean_path, scene_names
+from workflow.settings.names import SCENE_NAME, did_you_mean, did_you_mean_path, scene_names
 
 FOLDERS = ("scenes", "plan", "bench", "relight", "score")
 """Folders of targets that are named after one scene."""
@@ -61,6 +62,8 @@ def refuse_profile(given: str, start: Path, checkout: Path) -> None:
 
 def _meant(target: str, scenes: list[str], rules: list[str]) -> str:
     parts = Path(target).parts or (target,)
+    if parts[0] in FOLDERS and len(parts) > 1 and parts[1] in scenes and not re.fullmatch(SCENE_NAME, parts[1]):
+        return f" A scene cannot be called {parts[1]!r}: rename config/scenes/{parts[1]}.yaml."
     if target == "status":
         return " Ask `python -m workflow status`, which needs no Snakemake."
     if target in scenes:

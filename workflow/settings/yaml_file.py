@@ -27,6 +27,10 @@ class _Strict:
             # `{a: 2,6}` is `{a: 2, 6: null}`.
             if node.flow_style and before.isdigit() and key_node.value.isdigit() and not value_node.value:
                 raise _fault(f"a comma in a number? Write {before}.{key_node.value} with a point", key_node.start_mark)
+            # `{kind:folder}` is `{"kind:folder": null}`.
+            joined = re.fullmatch(r"(\w+):(\S.*)", key_node.value) if isinstance(key_node, yaml.ScalarNode) else None
+            if joined and not key_node.style and isinstance(value_node, yaml.ScalarNode) and not value_node.value:
+                raise _fault(f"a space is missing after a colon: write {joined[1]}: {joined[2]}", key_node.start_mark)
             before = value_node.value if isinstance(value_node, yaml.ScalarNode) else ""
             if key_node.tag == "tag:yaml.org,2002:merge":
                 raise _fault("`<<` is not read; write the keys themselves", key_node.start_mark)
@@ -115,7 +119,8 @@ def parse_yaml(text: str) -> Any:
 MISTAKES = {
     "found character '\\t'": "; YAML takes spaces, no tabs: replace them",
     "expected <block end>": "; is this line, or the one before, indented like its neighbours?",
-    "mapping values are not allowed": "; is this line indented like its neighbours? A value with a colon needs quotes",
+    "mapping values are not allowed": "; is this line indented like its neighbours, and does a space follow each colon before it?"
+    " A value with a colon needs quotes",
 }
 """What the parser says -> what people did."""
 

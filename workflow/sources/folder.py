@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.camera.alignment import Photo
+from iif_core.camera.exposure import ExposureGains
 from iif_core.errors import InputError
 from workflow.decisions import camera as camera_decisions
 from workflow.decisions.record import Decision
@@ -95,16 +96,20 @@ def capture_photographs(job: Job, inputs: Inputs) -> None:
     said += notes.of_blank(inputs.cameras.path, taken.blank, used)
     said += _checked_alignment(task, taken)
     views = taken.views
-    if settings.exposure == "estimate":
-        views, words = _estimated(task, taken, CaptureWriter(job.writer))
-        said += words
+    estimated = task.asks_exposures
+    if estimated:
+        found = taken.shared.gains()
+        estimated = settings.exposure == "estimate" or not exposure.are_alike(found)
+        said += notes.of_exposures(found, not estimated)
+    if estimated:
+        views = _exposed(task, taken, found, CaptureWriter(job.writer))
     said += notes.of_pixels(posed.frames, taken.counts, [*forms, *taken.forms])
     said += notes.of_views(posed.frames, views, task.listed, settings.test_every, task.encoded)
     said += notes.of_objects(posed.frames, surface, inputs.mesh.name)
     # Cameras see the scan alone: what an added wall would show is not what is there.
     closed = surface.enclosed(source.close, [view.world_from_camera for view in views])
     said += closed.notes[len(surface.notes) :]
-    facts = held.facts(names), len(closed.faces) - len(surface.faces)
+    facts = held.facts(names), len(closed.faces) - len(surface.faces), estimated
     _write(job, task, posed, taken, views, closed, said, *facts, decision, origin)
 
 
@@ -120,6 +125,12 @@ class _Task:
     room: Room
     splits: Sequence[str] = ()
     borders: Mapping[borders.Size, borders.Unpictured] = field(default_factory=dict)
+
+    @property
+    def asks_exposures(self) -> bool:
+        """The photographs are asked for their exposures."""
+        given = self.inputs.exposures, self.inputs.cameras.frames
+        return exposure.are_asked_for(*given, self.settings.exposure, self.encoded)
 
     @property
     def encoded(self) -> bool:
@@ -275,7 +286,7 @@ def _take(job: Job, task: _Task, posed: registration.Registered, gains: list[flo
             edges = alignment.edge_pictures(seen.pixels, seen.valid, depth, task.room.normals_of(face))
             out.aligned.add_edges(frame.name, *edges, frame.name in compared)
             out.trials += [_trial(frame, view, seen)] * (frame.name in tried)
-        if task.settings.exposure == "estimate":
+        if task.asks_exposures:
             points = view.world_from_camera[:3, 3] + depth[..., None] * view.directions()
             shared.add(seen.pixels, seen.valid & (face >= 0), points, float(np.median(depth[face >= 0])) / view.fx)
     return out
@@ -295,20 +306,18 @@ def _trial(frame: Frame, view: View, one: Photograph) -> alignment.Trial:
     return frame, small, *images.reduce_area(one.pixels, one.valid, small.width, small.height)
 
 
-def _estimated(task: _Task, taken: _Taken, writer: CaptureWriter) -> tuple[list[View], list[str]]:
-    """Return the views with estimated exposures, and notes. Held-out views keep 1, because scoring estimates theirs; radiance is
+def _exposed(task: _Task, taken: _Taken, found: ExposureGains, writer: CaptureWriter) -> list[View]:
+    """Return the views with exposures that were found. Held-out views keep 1, because scoring estimates theirs; radiance is
     written again, divided by its exposure."""
     own = [i for i, view in enumerate(taken.views) if view.split != "test"]
-    found = taken.shared.gains()
-    words = notes.of_exposures(found)
     if task.encoded:
         gain = {taken.views[i].view_id: float(g) for i, g in zip(own, found.gain, strict=True)}
-        return [replace(v, exposure=gain[v.view_id]) if v.view_id in gain else v for v in taken.views], words
+        return [replace(v, exposure=gain[v.view_id]) if v.view_id in gain else v for v in taken.views]
     for i, gain in zip(own, found.gain, strict=True):
         frame, view = taken.frames[i], taken.views[i]
         one = task.photograph(frame, view, float(gain)).without_black(task.encoded)
         _write_photograph(task, writer, frame, view, one, task.room.seen(view)[1])
-    return taken.views, words
+    return taken.views
 
 
 def _write(
@@ -321,6 +330,7 @@ def _write(
     said: list[str],
     held: dict[str, object],
     added: int,
+    estimated: bool,
     decided: list[Decision],
     origin: np.ndarray,
 ) -> None:
@@ -334,7 +344,7 @@ def _write(
         "registration": posed.facts,
         "plan": [*posed.plan, *decided],
         "origin": origin.tolist(),
-        "exposure_estimated": task.settings.exposure == "estimate",
+        "exposure_estimated": estimated,
         "stated_exposure": _stated(task, posed.frames),
         **({"held_out": held} if held else {}),
         **({"added_faces": added} if added else {}),

@@ -13,6 +13,7 @@ from workflow import plugins
 from workflow.artifacts.store import ids_to_disk
 from workflow.decisions import objects as decisions
 from workflow.runtime.job import Job
+from workflow.scene.base_scene import made_up_objects
 from workflow.scene.normal_form import CaptureReader
 from workflow.segmentations.face_colour import object_albedo
 from workflow.segmentations.stability import measure_stability
@@ -70,6 +71,5 @@ def _described(surface: Surface, objects: Objects) -> list[str]:
     """Return names by colour and place for objects without one; what the capture built around the scan comes last in its mesh."""
     albedo, pixels = object_albedo(surface, objects)
     label = objects.object_of_face
-    built = np.ones(len(albedo), bool)
-    built[label[: len(label) - int(surface.capture.facts.get("added_faces", 0))]] = False
+    built = made_up_objects(label, len(albedo), int(surface.capture.facts.get("added_faces", 0)))
     return described(label, surface.vertices, surface.faces, albedo, pixels > 0, surface.capture.up, built)

@@ -220,7 +220,8 @@ def search_emitters(
     given = {f: float(power[family[: groups.size] == f].max()) for f in shown}
     suspects = sorted((f for f, value in brightest.items() if value < certain), key=lambda f: -given[f])[:SUSPECTS]
     # Without light from outside something in the room has to shine.
-    doubtful = frozenset(f for f, value in brightest.items() if sky is not None and value < HIDDEN_EXCESS and weights[f] >= 1.0)
+    outside = sky is not None or (scene.made_up is not None and bool(scene.made_up.any()))
+    doubtful = frozenset(f for f, value in brightest.items() if outside and value < HIDDEN_EXCESS and weights[f] >= 1.0)
     evidence = LampEvidence(
         is_likely=np.append(odds.is_likely, False)[owner],
         is_saturated=np.array([look.is_saturated(f) for f in family.tolist()], bool),

@@ -129,7 +129,8 @@ class LampOdds:
 
     @classmethod
     def of(cls, photos: Photographs, looks: ObjectLooks) -> LampOdds:
-        """Judge all objects; those that cameras see are as likely as is usual, unless they are saturated and overhead."""
+        """Judge all objects; those that cameras see are as likely as is usual, unless they are saturated and overhead. Sides that
+        were built around a scan are as likely as those."""
         scene = photos.scene
         count = scene.n_objects
         known = looks.known(scene, photos.options.min_observations)
@@ -141,11 +142,13 @@ class LampOdds:
         if len(asked):
             overhead[asked] = heights(photos.tracer, scene, asked, np.asarray(photos.up)) >= OVERHEAD
         likely = overhead & looks.is_saturated
+        if scene.made_up is not None:  # what would come in through the openings that they close comes from them
+            likely |= scene.made_up
         return cls(np.where(likely, LIKELY, np.where(seen | overhead, 1.0, UNLIKELY)))
 
     @property
     def is_likely(self) -> np.ndarray:
-        """(O,) bool: the object hangs overhead, and what is seen of it is saturated."""
+        """(O,) bool: the object hangs overhead, and what is seen of it is saturated; or it was built where light may come in."""
         return self.odds > 1.0
 
     @property
@@ -159,7 +162,7 @@ class LampEvidence:
     """What speaks for each of G groups of emitters to be a lamp, and not surface that light falls on or passes through.
 
     Attributes:
-        is_likely: (G,) bool, of an object that hangs overhead and is saturated; is_saturated: (G,) bool, most of what is seen of
+        is_likely: (G,) bool, of an object that is likely (`LampOdds`); is_saturated: (G,) bool, most of what is seen of
             its family is; is_hidden: (G,) bool, no camera sees it.
         needed: (G,) logarithm by which the misfit (Eq. L.40) grows without its family, in the first look at all candidates.
     """

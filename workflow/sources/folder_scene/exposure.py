@@ -20,6 +20,8 @@ from workflow.sources.folder_scene.frames import Frame
 MAX_PIXELS = 2_000_000  # of all views together
 MIN_CELL_EDGE = 0.02  # metres; finer cells would hold single pixels
 DARK, BRIGHT = 0.03, 0.97  # sensor values outside of this range are dominated by noise or saturated
+ALIKE = 0.1
+"""Nine tenths of photographs whose log exposures are off by less from their mean count as equally exposed."""
 
 
 def read_given(path: Path, frames: list[tuple[str, str]]) -> list[float]:
@@ -52,22 +54,33 @@ def given(path: Path | None, frames: Sequence[Frame], setting: str) -> tuple[lis
     Args:
         path: exposures.json, if there is one.
         frames: of which the source may know exposures itself.
-        setting: `capture.exposure`, `given` or `estimate`.
+        setting: `capture.exposure`.
 
     Raises:
         InputError: as `read_given`.
     """
     known, ones = [frame.exposure for frame in frames if frame.exposure is not None], [1.0] * len(frames)
-    if known and setting == "given":
-        return known, []
-    if path is None:
-        if setting == "given" and len(frames) > 1:
-            note = "no exposures.json: the photographs count as equally exposed; with automatic exposure, set"
-            return ones, [f"{note} `capture: {{exposure: estimate}}`"]
-        return ones, []
     if setting == "estimate":
-        return ones, ["exposures.json is not used: `capture.exposure` is estimate"]
-    return read_given(path, [(frame.name, frame.file_path) for frame in frames]), []
+        return ones, ["exposures.json is not used: `capture.exposure` is estimate"] if path else []
+    if known:
+        return known, []
+    if path:
+        return read_given(path, [(frame.name, frame.file_path) for frame in frames]), []
+    if setting == "given" and len(frames) > 1:
+        note = "no exposures.json: the photographs count as equally exposed; with automatic exposure, set"
+        return ones, [f"{note} `capture: {{exposure: estimate}}`"]
+    return ones, []
+
+
+def are_asked_for(path: Path | None, frames: Sequence[Frame], setting: str, encoded: bool) -> bool:
+    """Return whether exposures are looked for in the photographs. Arguments as of `given`; `encoded`: they are 8-bit values."""
+    unknown = path is None and all(frame.exposure is None for frame in frames)
+    return setting == "estimate" or (setting == "auto" and encoded and unknown and len(frames) > 1)
+
+
+def are_alike(gains: ExposureGains) -> bool:
+    """Return whether photographs are equally exposed, as far as the surface that they share tells (`ALIKE`)."""
+    return not gains.estimated.any() or float(np.quantile(np.abs(np.log(gains.gain[gains.estimated])), 0.9)) < ALIKE
 
 
 class SharedSurface:

@@ -57,9 +57,14 @@ def of_blank(path: Path, blank: Mapping[str, list[str]], count: int) -> list[str
     return out
 
 
-def of_exposures(gains: ExposureGains) -> list[str]:
-    """Describe exposures that were estimated."""
+def of_exposures(gains: ExposureGains, alike: bool) -> list[str]:
+    """Describe exposures that were estimated; `alike`: they count as equal."""
     out = []
+    if alike:
+        if not gains.pairs:
+            return ["exposure: the photographs share no surface that would tell; they count as equally exposed"]
+        low, high = gains.gain.min(), gains.gain.max()
+        return [f"exposure: the photographs are equally exposed, as the surface that they share says ({low:.3g} to {high:.3g})"]
     apart = int((~gains.estimated).sum())
     groups = int(gains.group.max()) + 1
     if apart:
