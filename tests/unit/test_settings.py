@@ -54,6 +54,11 @@ def test_what_is_read_decides_where_specular_light_is_traced_and_how_noisy_diffu
         ("source: {kind: photographs, path: a, room_height: 2.6 m}", ["source.room_height", "'2.6 m'", "2.6"]),
         ("source: {kind: photographs, path: a, room_height: 260}", ["source.room_height", 260, "metres"]),
         ("source: {kind: folder, path: a, room_height: 2.6}", ["source.room_height", "`kind: photographs`"]),
+        ("source: {kind:folder, path: a}", ["kind: folder", "space"]),
+        ("source:\n  kind:folder\n", ["source", "kind: folder", "space"]),
+        ("source:\n  kind:folder\n  path: a\n", ["line 3", "space"]),
+        ("source: {kind: folder, path: a, unit: milimetre}", ["source.unit", "'milimetre'", "'mm'", "a number"]),
+        ("source: {kind: folder, path: a, unit: Feet}", ["source.unit", "'ft'"]),
         ("source: {kind: folder, path: a}\ncapture: {exposure: automatic}", ["capture.exposure", "'automatic'", "'auto'"]),
     ],
 )

@@ -189,7 +189,9 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
             hint = f" It is `{RENAMED[dotted]}` now." if dotted in RENAMED else hint or _of_another_kind(where)
             lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
         elif kind in ("model_type", "model_attributes_type", "dict_type"):
-            lines.append(f"{path}: `{dotted}`: found {shown(found)}, needed `key: value` pairs, e.g. {_example_of(where)}.")
+            joined = re.fullmatch(r"(\w+):(\S+)", found) if isinstance(found, str) else None
+            hint = f" A space is missing after its colon: `{joined[1]}: {joined[2]}`." if joined else ""
+            lines.append(f"{path}: `{dotted}`: found {shown(found)}, needed `key: value` pairs, e.g. {_example_of(where)}.{hint}")
         elif kind == "missing":
             example = EXAMPLES.get(str(where[0]), "config/scenes/kitchen.yaml")
             lines.append(f"{path}: `{dotted}`: missing. Add it; {example} is a complete example.")
