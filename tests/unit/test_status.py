@@ -236,6 +236,16 @@ def test_a_scene_that_cannot_be_used_is_refused(project):
     Path("config/scenes/c.yaml").write_text(TINY + "sede: 4\n")
     assert "no/where" in stand("b").reason and "`sede`: unknown key" in stand("c").reason
     assert {stand(name).state for name in "bcd"} == {"refused"} and "not found" in stand("d").reason
+    published()  # an earlier result of `a`, whose file has a mistake now
+    Path("config/scenes/a.yaml").write_text(TINY + "sede: 4\n")
+    assert "earlier result" in stand("a").reason and "earlier result" not in stand("b").reason
+
+
+def test_scenes_that_were_never_begun_are_named(project, capsys):
+    Path("config/batch.tsv").write_text("name\tbase\nx\ta\n")
+    assert status.tell([], lambda _: "draft") == 0
+    assert capsys.readouterr().out.splitlines()[-1].endswith("never begun: a")
+    assert status.tell(["x"], lambda _: "draft") == 0 and "never begun" not in capsys.readouterr().out
 
 
 def test_a_file_of_a_deliverable_that_was_changed_is_told(project):
@@ -404,7 +414,9 @@ def test_lines_fit_the_terminal_and_hold_nothing_that_steers_it():
     now = 1e9
     rows = [
         standing.Standing("kitchen", "running", "base", ("base", "prior"), "draft", now - 42, 60.0, 100.0, 1234.0, 50.0),
-        standing.Standing("a", "failed", "room", since=now - 3 * 86400, reason="\x1b[2Jno\nlight" + "x" * 300),
+        standing.Standing(
+            "a", "failed", "room", since=now - 3 * 86400, remaining_cpu_seconds=70.0, reason="\x1b[2Jno\nlight" + "x" * 300
+        ),
     ]
     first, running, failed, last = status.text(rows, now, 100)
     assert first.split() == ["scene", "state", "stage", "for", "CPU", "memory"]

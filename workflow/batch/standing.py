@@ -90,7 +90,8 @@ def standing(scene: str, quality_of: Callable[[str], str], silence: float = SILE
         except InputError as error:  # of a running scene: its data were taken away meanwhile
             if running:
                 return replace(found, state="running", stage=running[0], since=jobs[running[0]].since)
-            return replace(found, state="refused", reason=str(error))
+            earlier = f" (scenes/{scene} holds an earlier result)" if os.path.isfile(f"scenes/{scene}/{MANIFEST}") else ""
+            return replace(found, state="refused", reason=f"{error}{earlier}")
     except Exception as error:  # one scene must not hide hundreds of others
         return Standing(scene, "unknown", reason=f"{type(error).__name__}: {error}")
 

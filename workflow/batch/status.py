@@ -62,6 +62,9 @@ def tell(named: Sequence[str], quality_of: Callable[[str], str], as_json: bool =
     found = list(standing.survey(scenes, quality_of))
     width = shutil.get_terminal_size((UNBOUNDED, 24)).columns  # or those that `COLUMNS` says, as `watch` does
     lines = [json_line(one, now) for one in found] if as_json else text(found, now, width)
+    others = [] if named or as_json else sorted(set(scene_names()) - set(scenes))
+    if others:
+        lines.append(f"also in config/scenes, never begun: {', '.join(others)}")
     try:
         print("\n".join(lines), flush=True)
     except BrokenPipeError:  # `| head` has seen enough
@@ -114,7 +117,8 @@ def total(found: Sequence[Standing]) -> str:
     quality under which they were looked at."""
     counts = {state: sum(one.state == state for one in found) for state in STATES}
     parts = [f"{count} {state}" for state, count in counts.items() if count]
-    spent, left = sum(one.cpu_seconds for one in found), sum(one.remaining_cpu_seconds or 0.0 for one in found)
+    spent = sum(one.cpu_seconds for one in found)
+    left = sum(one.remaining_cpu_seconds or 0.0 for one in found if one.state != "failed")  # those wait for a person
     so_far = f"{duration(spent)} of CPU time so far" if spent else "nothing done so far"
     to_go = f", about {duration(left)} to go" if left else ""
     name = "scene" if len(found) == 1 else "scenes"
