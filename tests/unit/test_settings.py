@@ -352,6 +352,13 @@ def test_a_comparison_needs_two_names(repository):
         settings.refuse_target("compare/kitchen", [], repository)
 
 
+def test_a_name_that_no_scene_can_have_is_not_proposed(scene):
+    root = scene("source: {kind: folder, path: a}\n")
+    (root / "config/scenes/x.yaml").rename(root / "config/scenes/my room.yaml")
+    with refused("plan/my room", "config/scenes/my room.yaml"):
+        settings.refuse_target("plan/my room", [], root)
+
+
 def test_the_profiles_of_slurm_know_every_stage(repository):
     """A stage that no group names would be a job by itself between those of its scene."""
     from workflow.registry import STAGES

@@ -238,6 +238,8 @@ def test_a_scene_that_cannot_be_used_is_refused(project):
     assert {stand(name).state for name in "bcd"} == {"refused"} and "not found" in stand("d").reason
     published()  # an earlier result of `a`, whose file has a mistake now
     Path("config/scenes/a.yaml").write_text(TINY + "sede: 4\n")
+    for cache in (fp.resolved, fp.fingerprint):
+        cache.cache_clear()
     assert "earlier result" in stand("a").reason and "earlier result" not in stand("b").reason
 
 
