@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.reconstruction.sweep import Picture
-from iif_core.surface.closest import closest_points
+from iif_core.surface.closest import closest_points, hidden_from
 from iif_core.surface.enclosure import BESIDE, Enclosure, enclosure, moved
 from iif_core.surface.triangles import face_geometry
 
@@ -87,7 +87,8 @@ class Walls(NamedTuple):
 def flat_walls(
     vertices: NDArray, faces: NDArray, depths: Sequence[NDArray], pictures: Sequence[Picture], points: NDArray | None = None
 ) -> tuple[Walls, NDArray]:
-    """Return the planes around a room, and (m,) bool: the faces of its mesh whose place they take.
+    """Return the planes around a room, and (m,) bool: the faces of its mesh whose place they take, and those behind them that
+    no picture can see.
 
     The planes are those of `enclosure`; along the axes of the room a little surface is enough, such as a picture or a door on a
     wall without texture. A square of a plane is built unless depth maps show something behind it, as through a
@@ -112,7 +113,7 @@ def flat_walls(
     # -------- squares of planes, with nothing behind them, and the surface whose place they take --------
     middle, of_plane = corners[quads].mean(1), is_plane[side]
     kept = ~_seen_through(middle, depths, pictures)
-    found, thickness = np.zeros(len(quads), bool), np.maximum(NEAR, DEVIATIONS * error)
+    found, thickness = np.zeros(len(quads), bool), np.fmax(NEAR, DEVIATIONS * error)  # sides at the extent have no error
     found[of_plane] = _distance(vertices, faces, middle[of_plane]) <= thickness[side[of_plane]]
     own = kept & of_plane
     flat = _lies_on(sides, thickness, corners, quads[own], side[own], vertices, faces)
@@ -137,7 +138,8 @@ def flat_walls(
     placed = placed - (BEHIND * hides)[:, None] * sides.normal[of_corner]
     local = local.reshape(-1, 4)
     both = np.concatenate([local[:, [0, 1, 2]], local[:, [0, 2, 3]]])
-    return Walls(placed, both, np.tile(side, 2), np.tile(found, 2), sides, error), flat
+    walls = Walls(placed, both, np.tile(side, 2), np.tile(found, 2), sides, error)
+    return walls, flat | _behind(walls, thickness, vertices, faces, depths, pictures)
 
 
 def room_axes(middle: NDArray, normal: NDArray, area: NDArray) -> NDArray:
@@ -226,6 +228,24 @@ def _lies_on(
         count[close] += 1
         parallel[close] |= np.abs(normal[close] @ inward) > PARALLEL
     return parallel | (count > 1)
+
+
+def _behind(
+    walls: Walls, thickness: NDArray, vertices: NDArray, faces: NDArray, depths: Sequence[NDArray], pictures: Sequence[Picture]
+) -> NDArray:
+    """Return (m,) bool: the faces of a mesh that lie as a whole behind some side, by more than its `thickness` (s,), and that
+    squares hide from all pictures that have them in view: they are noise."""
+    behind = np.zeros(len(faces), bool)
+    for number, inward in enumerate(walls.sides.normal):
+        place = walls.sides.vertices[walls.sides.faces[walls.sides.side == number][0, 0]]
+        behind |= (((place - vertices) @ inward)[faces] > thickness[number]).all(1)
+    far = np.flatnonzero(behind)
+    middle = vertices[faces[far]].mean(1)
+    for depth, picture in zip(depths, pictures, strict=True) if len(far) and len(walls.faces) else ():
+        inside = picture.pixels(middle, depth.shape)[3] & behind[far]
+        hidden = hidden_from(walls.vertices, walls.faces, picture.centre, middle[inside])
+        behind[far[np.flatnonzero(inside)[~hidden]]] = False
+    return behind
 
 
 def turn_to_walls(walls: Walls) -> NDArray:

@@ -1,8 +1,8 @@
-"""The nearest points on a triangle mesh, by Open3D."""
+"""The nearest points on a triangle mesh, and what it hides, by Open3D."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,10 +27,7 @@ def closest_points(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) -> 
     """
     import open3d as o3d
 
-    points = np.ascontiguousarray(points, np.float32).reshape(-1, 3)
-    scene = o3d.t.geometry.RaycastingScene()
-    corners = np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.uint32)
-    scene.add_triangles(*(o3d.core.Tensor(array) for array in corners))
+    points, scene = np.ascontiguousarray(points, np.float32).reshape(-1, 3), _scene(vertices, faces)
     out = Closest(np.empty_like(points), np.empty(len(points), np.int64), np.empty((len(points), 3), np.float32))
     for first in range(0, len(points), CHUNK):
         here = slice(first, first + CHUNK)
@@ -40,3 +37,29 @@ def closest_points(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) -> 
         # Open3D gives the weights of the second and third corner.
         out.barycentric[here] = np.stack([1 - second.sum(1), second[:, 0], second[:, 1]], 1)
     return out
+
+
+def hidden_from(vertices: ArrayLike, faces: ArrayLike, eye: ArrayLike, points: ArrayLike) -> NDArray:
+    """Return (n,) bool: the mesh lies between `eye` (3,) and each of `points` (n, 3), metres.
+
+    Args:
+        vertices, faces: (v, 3) and (m, 3), m >= 1.
+    """
+    import open3d as o3d
+
+    points, scene = np.asarray(points, np.float64).reshape(-1, 3), _scene(vertices, faces)
+    rays = np.concatenate([np.broadcast_to(eye, points.shape), points - np.asarray(eye, np.float64)], 1).astype(np.float32)
+    out = np.zeros(len(points), bool)
+    for first in range(0, len(points), CHUNK):
+        here = slice(first, first + CHUNK)
+        out[here] = scene.test_occlusions(o3d.core.Tensor(rays[here]), tnear=0.0, tfar=1.0).numpy()
+    return out
+
+
+def _scene(vertices: ArrayLike, faces: ArrayLike) -> Any:
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    corners = np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.uint32)
+    scene.add_triangles(*(o3d.core.Tensor(array) for array in corners))
+    return scene

@@ -284,6 +284,21 @@ def test_walls_take_the_place_of_noisy_surface_and_close_what_is_missing():
     assert flat[:-2].mean() > 0.97
 
 
+def test_what_lies_behind_walls_goes_and_what_a_door_shows_stays():
+    vertices, faces = fine(*room())
+    middle = vertices[faces].mean(1)
+    faces = faces[~((middle[:, 1] < -1.99) & (np.abs(middle[:, 0]) < 0.45) & (middle[:, 2] < 0.75))]
+    piece = np.array([[-0.1, 0.0, -0.1], [0.1, 0.0, -0.1], [0.0, 0.0, 0.1]])
+    places = np.array([[0.0, -3.0, 0.0], [1.5, -3.0, 0.0], [1.5, -2.03, 0.0], [0.0, 3.0, 0.0], [1.0, 1.0, 0.0], [4.0, -3.0, 0.0]])
+    loose = np.concatenate([piece + place for place in places])
+    every = np.concatenate([faces, np.arange(len(loose)).reshape(-1, 3) + len(vertices)])
+    # A little of the surface may be behind a plane that bounds a room.
+    _, gone = flat_walls(np.concatenate([vertices, loose]), every, *looks_through_a_door())
+    shown, hidden, on_wall, behind_other, inside, aside = gone[len(faces) :]
+    assert hidden and behind_other and aside and on_wall  # that one is of the wall
+    assert not (shown or inside)
+
+
 def test_walls_at_the_extent_close_a_room_behind_what_is_there():
     """One side of the room is so uneven that it is no plane, and part of it was not found."""
     vertices, faces = fine(*room(((0, 1),)))

@@ -89,6 +89,11 @@ def test_the_worst_photograph_is_named():
     assert any("IMG_004" in finding.text and "15.9" in finding.text for finding in said.findings)
 
 
+def test_held_out_scores_stand_next_to_those_of_the_other_photographs():
+    said = judge(dataclasses.replace(GOOD, others=28.4)).lights[2]
+    assert any("27.0" in finding.text and "28.4" in finding.text for finding in said.findings) and said.level == GREEN
+
+
 def test_nothing_that_lights_the_room():
     assert changed(lamps=0)["light"] == RED
     finding = judge(dataclasses.replace(GOOD, lamps=0)).lights[1].findings[0]

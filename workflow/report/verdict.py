@@ -129,7 +129,7 @@ class Evidence:
         misfit: of the light; light_spread: of the light against the truth.
         worst: the photograph whose re-rendering is worst, and its PSNR.
         held_out, used: PSNR of re-renderings of photographs that were held out, and that were used.
-        held_out_views: number of held-out photographs.
+        held_out_views: number of held-out photographs; others: PSNR of the mean of the other photographs on these.
         albedo, roughness, metallic: PSNR against the truth, as they are; has_truth: whether there is truth.
         roughness_interval: half of the 95 % interval of roughness, median over the pixels; None if less than half have one.
         prior: kind of the prior.
@@ -163,6 +163,7 @@ class Evidence:
     light_spread: float | None = None
     held_out: float | None = None
     held_out_views: int = 0
+    others: float | None = None
     used: float | None = None
     worst: tuple[str, float] | None = None
     albedo: float | None = None
@@ -471,8 +472,9 @@ def _materials(e: Evidence) -> Light:
     worst = "" if e.worst is None else f"; of all, {e.worst[0]} is worst with {e.worst[1]:.1f}"
     if e.held_out is not None:
         held = _counted(e.held_out_views, "held-out photograph")
+        rival = "" if e.others is None else f", of which the mean of the other photographs has {e.others:.1f}"
         scored = _finding(
-            "rerendering", e.held_out, f"Re-renderings reach {{}} dB PSNR on {held}{worst}",
+            "rerendering", e.held_out, f"Re-renderings reach {{}} dB PSNR on {held}{rival}{worst}",
             _WORST_VIEWS, ".1f",
         )  # fmt: skip
     else:

@@ -11,6 +11,7 @@ import numpy as np
 
 from iif_core.camera.pixels import ViewPixels
 from iif_core.light.emission.cache import RadianceVoxels
+from iif_core.light.emission.colours import likely_colours
 from iif_core.light.emission.direct import (
     FAMILY_WIDTH,
     HIDDEN_WIDTH,
@@ -22,7 +23,7 @@ from iif_core.light.emission.direct import (
 )
 from iif_core.light.emission.environment import Sky, sky_prior
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, BaseAlbedo, GainOptions, ObjectGains
-from iif_core.light.emission.groups import EmitterGroups
+from iif_core.light.emission.groups import EmitterGroups, of_one_kind
 from iif_core.light.emission.hidden import with_hidden_surface
 from iif_core.light.emission.odds import LampEvidence, LampOdds, ObjectLooks
 from iif_core.light.emission.photographs import SEEDS, Photographs, choose_rows, radiance_cache
@@ -387,12 +388,20 @@ def solve(photos: Photographs, found: Traced, sky: Sky | None) -> EmissionSoluti
     problem, prior = found.problem, found.prior
     initial = prior.initial
     family = _families(photos, found.groups, len(initial))
+    # Where nothing but its light tells how bright a lamp is, lamps of one kind are alike.
+    groups, scene = found.groups, photos.scene
+    family[: groups.size] = of_one_kind(
+        groups, scene.vertices, scene.faces, family[: groups.size], problem.is_bounded(groups.size) | groups.is_hidden
+    )
     width = np.full(len(initial), FAMILY_WIDTH)
     if sky is not None and sky.is_unseen:
         outside = np.arange(found.groups.size, len(initial))
         together = outside if sky.sun is None else np.delete(outside, sky.sun)  # a sun is not like the sky around it
         family[together], width[together] = -1 - len(initial), OUTSIDE_WIDTH
-    return solve_families(problem.rows, prior, family, width).with_level_error(found.level_error)
+    solution, lamps = solve_families(problem.rows, prior, family, width), slice(groups.size)
+    radiance = solution.radiance.copy()
+    radiance[lamps] = likely_colours(radiance[lamps], solution.error[lamps], groups.area)
+    return replace(solution, radiance=radiance).with_level_error(found.level_error)
 
 
 def _families(photos: Photographs, groups: EmitterGroups, n_groups: int) -> np.ndarray:

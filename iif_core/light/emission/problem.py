@@ -60,6 +60,13 @@ class EmissionProblem:
         error = np.where(bound & (mean > observed), 0.0, error).mean(1)
         return float((self.pixels[used] * error).sum() / max(self.pixels[used].sum(), 1e-300))
 
+    def is_bounded(self, groups: int) -> np.ndarray:
+        """Return which of the first `groups` groups are seen, but never unsaturated: only bounds say how bright they look."""
+        first, second = self.rows.matrices
+        shown = 0.5 * np.abs(first + second)[self.anchor, :groups].max(2) > 0
+        bound = self.rows.lower_bound[self.anchor].any(1)
+        return shown.any(0) & ~shown[~bound].any(0)
+
     def take(self, keep: np.ndarray) -> EmissionProblem:
         """Return some of the rows."""
         return EmissionProblem(self.rows.take(keep), self.owner[keep], self.anchor[keep], self.pixels[keep])

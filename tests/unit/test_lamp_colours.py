@@ -1,0 +1,115 @@
+"""Colours of lamps, and lamps of one kind."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iif_core.light.emission.colours import AXES, SPREAD, likely_colours
+from iif_core.light.emission.groups import IN_PLANE, LARGEST, SAME_SIZE, SIDE_BY_SIDE, EmitterGroups, of_one_kind
+
+ONE = np.ones(1)
+
+
+def test_the_axes_hold_no_brightness():
+    np.testing.assert_allclose(AXES @ AXES.T, np.eye(2), atol=1e-15)
+    np.testing.assert_allclose(AXES.sum(1), 0.0, atol=1e-15)
+
+
+def test_colour_temperatures_spread_along_the_first_axis():
+    """A radiator of 2700 K (CIE 1931 x = 0.4599, y = 0.4106) in linear sRGB, where D65 is white."""
+    x, y = 0.4599, 0.4106
+    to_srgb = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
+    warm = AXES @ np.log(to_srgb @ [x / y, 1.0, (1 - x - y) / y])
+    assert warm[0] / np.sqrt(12) == pytest.approx(SPREAD[0], rel=0.1)  # spread evenly from white to there
+    assert abs(warm[1]) / np.sqrt(12) < SPREAD[1]  # the line of colours is nearly straight
+
+
+def test_by_hand():
+    """Two lamps of the same power: one known, the other green by an error as large as the spread."""
+    green = np.exp(0.3 * AXES[1])
+    radiance = np.stack([np.ones(3), green])
+    error = np.stack([np.full(3, 1e-9), SPREAD[1] * green])
+    found = likely_colours(radiance, error, np.array([green.mean(), 1.0]))
+    variance = SPREAD[1] ** 2 * np.array([(1e-3 / SPREAD[1]) ** 2, 1.0])
+    weight = 1.0 / (SPREAD[1] ** 2 + variance)
+    mean = weight @ [0.0, 0.3] / weight.sum()
+    expected = mean + SPREAD[1] ** 2 * weight * (np.array([0.0, 0.3]) - mean)
+    np.testing.assert_allclose(np.log(found) @ AXES[1], expected, atol=1e-12)
+    np.testing.assert_allclose(np.log(found) @ AXES[0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(found.mean(1), radiance.mean(1), rtol=1e-12)
+
+
+def test_what_is_known_stays_and_what_is_not_becomes_like_the_others():
+    radiance = np.array([[3.0, 2.0, 1.0], [1.0, 30.0, 0.0], [0.0, 0.0, 0.0]])
+    known = likely_colours(radiance[:1], 1e-6 * radiance[:1], ONE)
+    np.testing.assert_allclose(known, radiance[:1], rtol=1e-3)
+    error = np.array([[1e-6, 1e-6, 1e-6], [1e6, 1e6, 1e6], [1.0, 1.0, 1.0]])
+    found = likely_colours(radiance, error, np.array([1.0, 1e-3, 1.0]))
+    np.testing.assert_allclose(found[1] / found[1].sum(), radiance[0] / 6.0, rtol=0.1)
+    assert found[1].mean() == pytest.approx(31.0 / 3.0) and not found[2].any()
+    assert likely_colours(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)).shape == (0, 3)
+
+
+EXTREME = st.floats(0.0, 1e30)
+
+
+@given(st.lists(st.tuples(*[EXTREME] * 6, st.floats(0.0, 1e6)), min_size=1, max_size=6))
+def test_at_the_extremes(rows):
+    """Always finite, never negative, as bright as before; lamps of one colour keep it."""
+    rows = np.array(rows)
+    radiance, error, area = rows[:, :3], rows[:, 3:6], rows[:, 6]
+    found = likely_colours(radiance, error, area)
+    assert np.isfinite(found).all() and (found >= 0).all()
+    np.testing.assert_allclose(found.mean(1), radiance.mean(1), rtol=1e-9)
+    same = np.outer(np.abs(radiance).max(1), [0.5, 1.0, 0.7])
+    np.testing.assert_allclose(likely_colours(same, error, area + 1.0), same, rtol=1e-6, atol=1e-290)
+
+
+# -------------------------------------------------------------------------------------------------------------- kinds
+
+
+def squares(*placed):
+    """Vertices and faces of squares: (middle, edge, axis of the normal) each."""
+    vertices, faces = [], []
+    for middle, edge, axis in placed:
+        u, v = np.roll(np.eye(3), -axis - 1, 0)[:2]
+        first = len(vertices)
+        vertices += [np.array(middle) + 0.5 * edge * (a * u + b * v) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        faces += [[first, first + 1, first + 2], [first, first + 2, first + 3]]
+    return np.array(vertices), np.array(faces)
+
+
+def kinds(*placed, family=None, alike=None):
+    vertices, faces = squares(*placed)
+    count = len(placed)
+    of_face = np.repeat(np.arange(count), 2).astype(np.int32)
+    rows = np.full(count, 2, np.int32), np.ones(count), np.ones((count, 3)), np.ones(count, np.int64)
+    groups = EmitterGroups(of_face, np.ones_like(of_face), *rows, [])
+    family = np.arange(count) if family is None else np.array(family)
+    return of_one_kind(groups, vertices, faces, family, np.ones(count, bool) if alike is None else np.array(alike)).tolist()
+
+
+def test_lamps_of_the_same_size_are_of_one_kind_wherever_they_are():
+    assert kinds(([0, 0, 3], 0.2, 2), ([4, 0, 3], 0.21, 2), ([0, 2, 1], 0.2, 0), ([9, 9, 9], 0.4, 2)) == [0, 0, 0, 1]
+    above = 1.01 * np.sqrt(SAME_SIZE)
+    assert kinds(([0, 0, 3], 0.2, 2), ([4, 0, 3], 0.2 * above, 2)) == [0, 1]
+    edge = np.sqrt(LARGEST) * 1.01
+    assert kinds(([0, 0, 3], edge, 2), ([4, 0, 0], edge, 2)) == [0, 1]  # ceiling and floor
+
+
+def test_panes_side_by_side_are_of_one_kind():
+    gap = 0.9 * SIDE_BY_SIDE
+    big, small = ([0, 0, 1], 1.0, 0), ([0, 0.5 + gap + 0.2, 1], 0.4, 0)
+    assert kinds(big, small) == [0, 0]
+    assert kinds(big, ([0, 0.5 + 1.2 * SIDE_BY_SIDE + 0.2, 1], 0.4, 0)) == [0, 1]
+    assert kinds(big, ([1.1 * IN_PLANE, 0.7 + gap, 1], 0.4, 0)) == [0, 1]  # before it
+    assert kinds(big, ([0.0, 0.7 + gap, 1], 0.4, 1)) == [0, 1]  # square to it
+
+
+def test_only_what_looks_alike_is_joined_and_families_stay_together():
+    lamps = [([i, 0, 3], 0.2, 2) for i in range(4)]
+    assert kinds(*lamps, alike=[True, False, True, True]) == [0, 1, 0, 0]
+    assert kinds(*lamps, alike=[False] * 4, family=[5, 7, 5, 7]) == [0, 1, 0, 1]
+    assert kinds(*lamps, alike=[True, False, False, True], family=[5, 7, 7, 9]) == [0, 1, 1, 0]
+    assert kinds() == []
