@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import open3d as o3d
 import pandas as pd
 import trimesh
 from PIL import Image
@@ -40,6 +39,7 @@ from lab.rooms.room import Room
 from lab.sources.builtin import photograph_room
 from workflow.artifacts import StageReader
 from workflow.artifacts.files import read_exr
+from workflow.runtime import native
 from workflow.scene.normal_form import CaptureReader
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -107,7 +107,9 @@ def similarity(found: np.ndarray, true: np.ndarray) -> tuple[float, np.ndarray, 
     return scale, turn, true.mean(0) - scale * turn @ found.mean(0)
 
 
-def scene_of(vertices: np.ndarray, faces: np.ndarray) -> o3d.t.geometry.RaycastingScene:
+def scene_of(vertices: np.ndarray, faces: np.ndarray) -> Any:
+    import open3d as o3d
+
     scene = o3d.t.geometry.RaycastingScene()
     mesh = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.int32)))
     scene.add_triangles(mesh)
@@ -115,6 +117,8 @@ def scene_of(vertices: np.ndarray, faces: np.ndarray) -> o3d.t.geometry.Raycasti
 
 
 def distances(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    import open3d as o3d
+
     return scene_of(vertices, faces).compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
 
 
@@ -156,6 +160,8 @@ def geometry(packed: Path, made: Path) -> dict[str, float]:
 
 def _along_rays(frame: dict[str, Any], room: Any, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return distances of the true and of the found surface along some rays of a true camera."""
+    import open3d as o3d
+
     rng, pose = np.random.default_rng(0), np.array(frame["transform_matrix"])
     x, y = rng.uniform(0, frame["w"], RAYS), rng.uniform(0, frame["h"], RAYS)
     rays = np.stack([(x - frame["cx"]) / frame["fl_x"], -(y - frame["cy"]) / frame["fl_y"], -np.ones(RAYS)], 1) @ pose[:3, :3].T
@@ -224,6 +230,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--keep", action="store_true")
     options = parser.parse_args()
+    native.prepare()
     for room in options.rooms:
         row = row_of(options.folder.resolve(), room, options.views, options.width, options.height)
         print(json.dumps(row), flush=True)
