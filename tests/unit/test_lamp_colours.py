@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iif_core.light.emission.colours import AXES, SPREAD, likely_colours
-from iif_core.light.emission.groups import IN_PLANE, LARGEST, SAME_SIZE, SIDE_BY_SIDE, EmitterGroups, of_one_kind
+from iif_core.light.emission.groups import EmitterGroups
+from iif_core.light.emission.kinds import IN_PLANE, LARGEST, SAME_SIZE, SIDE_BY_SIDE, of_one_kind
 
 ONE = np.ones(1)
 

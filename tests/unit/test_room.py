@@ -76,8 +76,7 @@ def surface(parts):
 
 
 def test_every_emitter_is_a_lamp_up_to_sixteen():
-    lamp = quad((0, 0, 2), (0, 1, 0), (1, 0, 0))
-    many = [part(lamp, i, 20, f"lamp.emitter{i}", i, i) for i in range(20)]
+    many = [part(quad((0, 0, 2 + i), (0, 1, 0), (1, 0, 0)), i, 20, f"lamp.emitter{i}", i, i) for i in range(20)]
     radiance = np.linspace(1, 20, 20)[:, None] * np.float32([1, 0.5, 0.25])
     few = find_lamps(many[:3], radiance[:3], np.float32([0.1, 0.2, 0.4]))
     assert [one.name for one in few.lamps] == ["lamp, emitter 0", "lamp, emitter 1", "lamp, emitter 2", "light from outside"]
@@ -92,6 +91,22 @@ def test_every_emitter_is_a_lamp_up_to_sixteen():
     np.testing.assert_allclose(all_of_them.radiance[:6], radiance[:6])  # with their own colours
     np.testing.assert_array_equal(all_of_them.surroundings, sun)
     assert find_lamps([], np.zeros((0, 3)), np.zeros(3)).lamps == []
+
+
+def test_panes_of_a_window_are_one_lamp():
+    """Two panes with a bar of 10 cm between them, in two colours, and a lamp elsewhere; one of the panes is dark in another."""
+    places = ((0, 0, 1), (0, 1.1, 1), (3, 0, 2))
+    many = [part(quad(place, (0, 1, 0), (0, 0, 1)), i, 3, f"pane {i}.emitter{i}", i, i) for i, place in enumerate(places)]
+    radiance = np.float32([[1, 2, 3], [4, 4, 4], [1, 1, 1]])
+    found = find_lamps(many, radiance, np.zeros(3))
+    assert [(one.name, one.emitters) for one in found.lamps] == [
+        ("pane 1, emitter 1 and 1 beside it", (0, 1)),
+        ("pane 2, emitter 2", (2,)),
+    ]
+    np.testing.assert_allclose(found.radiance[:2], radiance[:2])  # each with its own colour
+    assert found.of_emitter.tolist() == [0, 0, 1]
+    alone = find_lamps(many, radiance * [[0], [1], [1]], np.zeros(3))
+    assert [one.emitters for one in alone.lamps] == [(1,), (2,)] and alone.of_emitter.tolist() == [-1, 0, 1]
 
 
 def test_what_no_photograph_shows_outside_is_grey():

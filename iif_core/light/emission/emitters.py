@@ -23,8 +23,9 @@ from iif_core.light.emission.direct import (
 )
 from iif_core.light.emission.environment import Sky, sky_prior
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, BaseAlbedo, GainOptions, ObjectGains
-from iif_core.light.emission.groups import EmitterGroups, of_one_kind
+from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.hidden import with_hidden_surface
+from iif_core.light.emission.kinds import of_one_kind
 from iif_core.light.emission.odds import LampEvidence, LampOdds, ObjectLooks
 from iif_core.light.emission.photographs import SEEDS, Photographs, choose_rows, radiance_cache
 from iif_core.light.emission.pixels import EmissionPixels

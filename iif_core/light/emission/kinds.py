@@ -1,0 +1,98 @@
+"""Lamps that people install to shine alike: of one size, or side by side as the panes of a window
+(docs/method/light.md#families)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from iif_core.light.emission.groups import EmitterGroups
+from iif_core.numerics.graph import component_labels
+from iif_core.surface.closest import closest_points
+from iif_core.surface.triangles import face_geometry
+
+SIDE_BY_SIDE = 0.15
+"""Metres between groups in one plane that are panes of one window."""
+IN_PLANE = 0.05
+"""Metres by which panes of one window may lie before or behind each other."""
+PARALLEL = float(np.cos(np.radians(10.0)))
+"""Cosine of the largest angle between them."""
+LARGEST = 1.0
+"""Area (m^2) up to which lamps of the same size are of one kind: larger surface is wall or ceiling."""
+SAME_SIZE = 1.2
+"""Largest ratio of the areas, and of the radii about their middle, of lamps of one kind."""
+
+
+def of_one_kind(
+    groups: EmitterGroups, vertices: np.ndarray, faces: np.ndarray, family: np.ndarray, alike: np.ndarray
+) -> np.ndarray:
+    """Join families of groups that people install to shine alike: lamps of the same size, and panes of one window, which lie side
+    by side in one plane.
+
+    Args:
+        groups: of F faces.
+        vertices, faces: (n, 3), metres, and (F, 3).
+        family: (G,) int.
+        alike: (G,) bool, groups that may be joined with others, as they look alike.
+
+    Returns:
+        (G,) int >= 0, numbers of the families.
+    """
+    number = np.flatnonzero(alike)
+    pieces = [Piece.of(vertices, faces[groups.of_face == g]) for g in number]
+    pairs = [
+        (number[i], number[j])
+        for j, second in enumerate(pieces)
+        for i, first in enumerate(pieces[:j])
+        if first.is_size_of(second) or first.is_beside(second)
+    ]
+    ends = np.array(pairs, np.int64).reshape(-1, 2)
+    first = np.unique(family, return_index=True, return_inverse=True)
+    own = np.column_stack([np.arange(groups.size), first[1][first[2].ravel()]])
+    ends = np.concatenate([ends, own])
+    return component_labels(groups.size, ends[:, 0], ends[:, 1])
+
+
+def side_by_side(pieces: Sequence[Piece]) -> np.ndarray:
+    """Return (n,) int >= 0, one number for all pieces that lie side by side, as the panes of one window do."""
+    pairs = [(i, j) for j, second in enumerate(pieces) for i, first in enumerate(pieces[:j]) if first.is_beside(second)]
+    ends = np.array(pairs, np.int64).reshape(-1, 2)
+    return component_labels(len(pieces), ends[:, 0], ends[:, 1])
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Faces (m, 3) of a lamp, their middle, area (m^2), radius about the middle (m), and the axis of most of their normals."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    middle: np.ndarray
+    area: float
+    radius: float
+    normal: np.ndarray
+
+    @classmethod
+    def of(cls, vertices: np.ndarray, faces: np.ndarray) -> Piece:
+        vertices = np.asarray(vertices, np.float64)
+        normal, area = face_geometry(vertices, faces)
+        middle = np.average(vertices[faces].mean(1), axis=0, weights=np.maximum(area, 1e-12))
+        radius = float(np.linalg.norm(vertices[faces].reshape(-1, 3) - middle, axis=1).max())
+        # The side that a normal faces is arbitrary; a lamp all around has none.
+        axis = np.linalg.eigh((normal * area[:, None]).T @ normal)[1][:, -1]
+        return cls(vertices, faces, middle, float(area.sum()), radius, axis)
+
+    def is_size_of(self, other: Piece) -> bool:
+        """Area and radius are the same (`SAME_SIZE`), and no larger than those of lamps."""
+        ratios = self.area / max(other.area, 1e-12), self.radius / max(other.radius, 1e-12)
+        return self.area <= LARGEST and all(1.0 / SAME_SIZE <= ratio <= SAME_SIZE for ratio in ratios)
+
+    def is_beside(self, other: Piece) -> bool:
+        """Both lie in one plane, next to each other."""
+        if abs(self.normal @ other.normal) < PARALLEL or abs((other.middle - self.middle) @ self.normal) > IN_PLANE:
+            return False
+        corners = other.vertices[np.unique(other.faces)]
+        return bool(
+            (np.linalg.norm(closest_points(self.vertices, self.faces, corners).points - corners, axis=1)).min() <= SIDE_BY_SIDE
+        )
