@@ -91,12 +91,13 @@ def kinds(*placed, family=None, alike=None):
     return of_one_kind(groups, vertices, faces, family, np.ones(count, bool) if alike is None else np.array(alike)).tolist()
 
 
-def test_lamps_of_the_same_size_are_of_one_kind_wherever_they_are():
-    assert kinds(([0, 0, 3], 0.2, 2), ([4, 0, 3], 0.21, 2), ([0, 2, 1], 0.2, 0), ([9, 9, 9], 0.4, 2)) == [0, 0, 0, 1]
+def test_lamps_of_the_same_size_in_one_plane_are_of_one_kind():
+    lamps = ([0, 0, 3], 0.2, 2), ([4, 0, 3], 0.21, 2), ([0, 2, 1], 0.2, 0), ([9, 9, 3], 0.4, 2), ([7, 7, 3.06], 0.2, 2)
+    assert kinds(*lamps) == [0, 0, 1, 2, 3]
     above = 1.01 * np.sqrt(SAME_SIZE)
     assert kinds(([0, 0, 3], 0.2, 2), ([4, 0, 3], 0.2 * above, 2)) == [0, 1]
     edge = np.sqrt(LARGEST) * 1.01
-    assert kinds(([0, 0, 3], edge, 2), ([4, 0, 0], edge, 2)) == [0, 1]  # ceiling and floor
+    assert kinds(([0, 0, 3], edge, 2), ([4, 0, 3], edge, 2)) == [0, 1]  # parts of a ceiling
 
 
 def test_panes_side_by_side_are_of_one_kind():

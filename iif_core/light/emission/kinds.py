@@ -1,4 +1,4 @@
-"""Lamps that people install to shine alike: of one size, or side by side as the panes of a window
+"""Lamps that people install to shine alike: in one plane and of one size, or side by side as the panes of a window
 (docs/method/light.md#families)."""
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from iif_core.surface.triangles import face_geometry
 SIDE_BY_SIDE = 0.15
 """Metres between groups in one plane that are panes of one window."""
 IN_PLANE = 0.05
-"""Metres by which panes of one window may lie before or behind each other."""
+"""Metres by which lamps of one plane may lie before or behind each other."""
 PARALLEL = float(np.cos(np.radians(10.0)))
 """Cosine of the largest angle between them."""
 LARGEST = 1.0
@@ -28,8 +28,8 @@ SAME_SIZE = 1.2
 def of_one_kind(
     groups: EmitterGroups, vertices: np.ndarray, faces: np.ndarray, family: np.ndarray, alike: np.ndarray
 ) -> np.ndarray:
-    """Join families of groups that people install to shine alike: lamps of the same size, and panes of one window, which lie side
-    by side in one plane.
+    """Join families of groups that people install to shine alike: in one plane, lamps of the same size, and panes of one
+    window, side by side.
 
     Args:
         groups: of F faces.
@@ -46,7 +46,7 @@ def of_one_kind(
         (number[i], number[j])
         for j, second in enumerate(pieces)
         for i, first in enumerate(pieces[:j])
-        if first.is_size_of(second) or first.is_beside(second)
+        if first.is_in_plane_of(second) and (first.is_size_of(second) or first.is_next_to(second))
     ]
     ends = np.array(pairs, np.int64).reshape(-1, 2)
     first = np.unique(family, return_index=True, return_inverse=True)
@@ -57,7 +57,12 @@ def of_one_kind(
 
 def side_by_side(pieces: Sequence[Piece]) -> np.ndarray:
     """Return (n,) int >= 0, one number for all pieces that lie side by side, as the panes of one window do."""
-    pairs = [(i, j) for j, second in enumerate(pieces) for i, first in enumerate(pieces[:j]) if first.is_beside(second)]
+    pairs = [
+        (i, j)
+        for j, second in enumerate(pieces)
+        for i, first in enumerate(pieces[:j])
+        if first.is_in_plane_of(second) and first.is_next_to(second)
+    ]
     ends = np.array(pairs, np.int64).reshape(-1, 2)
     return component_labels(len(pieces), ends[:, 0], ends[:, 1])
 
@@ -83,16 +88,17 @@ class Piece:
         axis = np.linalg.eigh((normal * area[:, None]).T @ normal)[1][:, -1]
         return cls(vertices, faces, middle, float(area.sum()), radius, axis)
 
+    def is_in_plane_of(self, other: Piece) -> bool:
+        """Both are flat enough to have a plane, and it is the same."""
+        return abs(self.normal @ other.normal) >= PARALLEL and abs((other.middle - self.middle) @ self.normal) <= IN_PLANE
+
     def is_size_of(self, other: Piece) -> bool:
         """Area and radius are the same (`SAME_SIZE`), and no larger than those of lamps."""
         ratios = self.area / max(other.area, 1e-12), self.radius / max(other.radius, 1e-12)
         return self.area <= LARGEST and all(1.0 / SAME_SIZE <= ratio <= SAME_SIZE for ratio in ratios)
 
-    def is_beside(self, other: Piece) -> bool:
-        """Both lie in one plane, next to each other."""
-        if abs(self.normal @ other.normal) < PARALLEL or abs((other.middle - self.middle) @ self.normal) > IN_PLANE:
-            return False
+    def is_next_to(self, other: Piece) -> bool:
+        """Some corner of the other is within `SIDE_BY_SIDE`."""
         corners = other.vertices[np.unique(other.faces)]
-        return bool(
-            (np.linalg.norm(closest_points(self.vertices, self.faces, corners).points - corners, axis=1)).min() <= SIDE_BY_SIDE
-        )
+        apart = np.linalg.norm(closest_points(self.vertices, self.faces, corners).points - corners, axis=1)
+        return bool(apart.min() <= SIDE_BY_SIDE)
