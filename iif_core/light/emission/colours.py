@@ -19,8 +19,11 @@ def likely_colours(radiance: np.ndarray, error: np.ndarray, area: np.ndarray) ->
 
     d_i = m + s^2 / (s^2 + e_i^2) (d_i - m)   along each of `AXES`
 
-    of the logarithm of the radiance, with the spread s of lamps (`SPREAD`), the errors e_i, and the mean m of the room's lamps by
-    power and certainty.
+    of the logarithm of the radiance, with the spread s of lamps (`SPREAD`), the errors e_i, and the mean of the room's lamps,
+
+    m = sum_i w_i d_i / (sum_i w_i + 1 / s^2),   w_i = (P_i / max P) / (s^2 + e_i^2),
+
+    by power P and certainty. It is near white, too, because cameras balance what they photograph.
 
     Args:
         radiance: (G, 3) >= 0.
@@ -40,8 +43,9 @@ def likely_colours(radiance: np.ndarray, error: np.ndarray, area: np.ndarray) ->
     # -------- along each axis: the colour of each lamp, its error, and the mean of all --------
     colour, variance = np.log(found) @ AXES.T, relative**2 @ (AXES**2).T
     prior = SPREAD**2
-    weight = (area[lit] * found.mean(1))[:, None] / (prior + variance)
-    mean = (weight * colour).sum(0) / np.maximum(weight.sum(0), 1e-300)
+    power = area[lit] * found.mean(1)
+    weight = (power / max(power.max(), 1e-300))[:, None] / (prior + variance)
+    mean = (weight * colour).sum(0) / (weight.sum(0) + 1.0 / prior)
     posterior = mean + prior / (prior + variance) * (colour - mean)
 
     out = np.zeros(radiance.shape)
