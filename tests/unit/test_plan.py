@@ -56,6 +56,8 @@ def test_values_say_what_was_measured():
     assert camera.camera_response("ldr", CHOSEN)["reason"] == "gamma it is"
     assert "1 because it pays" in materials.metallic(np.array([True, False]), np.array([0.1, 0.9]))["reason"]
     assert materials.affine_size(["full", "gain+bias", "full"])["reason"] == "2 full, 1 gain+bias"
+    said = {share: plan.environment("auto", 0.05, share, None)["reason"] for share in (plan.ESCAPE_OPEN, 1.01 * plan.ESCAPE_OPEN)}
+    assert ["ceiling" in reason for reason in said.values()] == [False, True]
     assert plan.environment("auto", np.nan, np.nan, None)["value"] == 0.0
 
 

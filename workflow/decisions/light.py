@@ -11,12 +11,6 @@ from iif_core.light.unexplained import SIGNIFICANT, Strength
 from workflow.decisions.plan import CACHE_COVERAGE
 from workflow.decisions.record import FORCED, SETTLED, Decision, decision
 
-ESCAPE_OPEN = 0.3
-"""Share of escaping rays from which the mesh counts as a part of a room. Its holes then show the rest of the room, which is near
-and looks different from everywhere, so the environment has twelve directions instead of a map of what the cameras see
-(docs/method/light.md#open-meshes)."""
-
-
 _SUN = "share by which the misfit falls with a sun"
 
 

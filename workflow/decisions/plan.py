@@ -17,6 +17,10 @@ ESCAPE_BRIGHTNESS = 0.02
 ESCAPE_LIGHT = 0.01
 """The same, times the share of rays from surface that leave, if the outside is no brighter than the photographs: what light from
 outside has to bring. A brighter one may be saturated, and its brightness a bound."""
+ESCAPE_OPEN = 0.3
+"""Share of escaping rays from which the mesh counts as a part of a room. Its holes then show the rest of the room, which is near
+and looks different from everywhere, so the environment has twelve directions instead of a map of what the cameras see
+(docs/method/light.md#open-meshes)."""
 CACHE_COVERAGE = 0.3
 """Share of secondary hits that must have been photographed for the radiance cache."""
 LATER = {
@@ -58,6 +62,8 @@ def environment(
             the mesh is another one now: then the shares decide, by their thresholds.
     """
     leaves = f"{escape_primary:.2%} of camera rays and {escape_secondary:.2%} of others leave the mesh"
+    if escape_secondary > ESCAPE_OPEN:
+        leaves += ", which is open: scan the walls, floor and ceiling that it lacks, if you can"
     dark = brightness is not None and (
         brightness <= ESCAPE_BRIGHTNESS or (brightness <= 1.0 and escape_secondary * brightness < ESCAPE_LIGHT)
     )

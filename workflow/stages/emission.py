@@ -18,8 +18,8 @@ from iif_core.light.emission.sensor import Sensor
 from iif_core.light.tracer import Tracer
 from iif_core.surface.segments import face_adjacency
 from workflow.decisions import light as decisions
+from workflow.decisions.plan import ESCAPE_OPEN, included
 from workflow.decisions.plan import environment as from_outside
-from workflow.decisions.plan import included
 from workflow.decisions.record import SETTLED, Decision
 from workflow.fitting.inputs import prediction_errors
 from workflow.runtime import device
@@ -87,7 +87,7 @@ def _light(job: Job, photos: Photographs, adjacency: np.ndarray) -> tuple[FoundL
     """Find the light of the scene, and what was decided about light from outside."""
     look = look_around(photos, adjacency)
     environment = _environment(job, photos, look)
-    light = find_light(photos, look, environment["included"], look.secondary > decisions.ESCAPE_OPEN)
+    light = find_light(photos, look, environment["included"], look.secondary > ESCAPE_OPEN)
     asked_for_sun = light.outside is not None and not light.is_open
     return light, [environment, *([decisions.sun(light.sun)] if asked_for_sun else [])]
 

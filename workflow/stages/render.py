@@ -9,6 +9,7 @@ from iif_core.camera.pixels import pixel_gains, pixel_steps
 from iif_core.evaluation.consistency import held_out_gain
 from workflow.artifacts.store import rgb, split_rgb
 from workflow.decisions import light as decisions
+from workflow.decisions.plan import ESCAPE_OPEN
 from workflow.models.denoise import denoise, require_denoiser
 from workflow.runtime import device
 from workflow.runtime.job import Job
@@ -51,7 +52,7 @@ def run(job: Job) -> None:
     world = Scene(geometry, material, emitters, cache)
     found: dict[int, np.ndarray] = {}
     unexplained = Unexplained(job, capture, scene, curve)
-    through_holes = job.read("emission").json("emission.json")["escape_share"]["secondary"] > decisions.ESCAPE_OPEN
+    through_holes = job.read("emission").json("emission.json")["escape_share"]["secondary"] > ESCAPE_OPEN
     white_balance = bool((gains.gain != gains.gain[:, :1]).any())
     for done, view in enumerate(capture.views):
         job.progress(done, len(capture.views), "views re-rendered")

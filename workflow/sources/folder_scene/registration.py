@@ -131,12 +131,12 @@ def _facts(names: Mapping[str, int], found: Registration, scale: float) -> dict[
 
 def _words(found: Registration, moved: float, plain: bool) -> list[str]:
     numbers = (
-        f"on surface that the fit did not see, texture of views differs by {found.held_out[1]:.3f} instead of"
-        f" {found.held_out[0]:.3f} (loss {found.gain:+.4f} +- {found.error:.4f}), photograph edges at mesh edges"
-        f" {found.edges[1]:.3f} instead of {found.edges[0]:.3f} (+- {found.edge_error:.4f})"
+        f"at edges of the mesh photographs have edges of {found.edges[1]:.3f} instead of {found.edges[0]:.3f}"
+        f" (+- {found.edge_error:.4f}), and on surface that was left aside for this they differ by {found.held_out[1]:.3f}"
+        f" instead of {found.held_out[0]:.3f} (a gain of {found.gain:+.4f} +- {found.error:.4f})"
     )
     if not found.accepted:
-        return [f"registration: poses and intrinsics taken as given; a correction by {moved:.1f} pixels would not pay: {numbers}"]
-    common = f", focal length times {found.focal:.4f}" if plain else ""
+        return [f"registration: poses and intrinsics are taken as given. Moved by {moved:.1f} pixels, {numbers}: no clear gain"]
+    common = f" and the focal length multiplied by {found.focal:.4f}" if plain else ""
     how = "each for itself" if found.each else "all alike"
-    return [f"registration: photographs moved by {moved:.1f} pixels (median), {how}{common}: {numbers}"]
+    return [f"registration: photographs were moved by {moved:.1f} pixels (median), {how}{common}: {numbers}"]
