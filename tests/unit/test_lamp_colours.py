@@ -81,11 +81,16 @@ def squares(*placed):
     return np.array(vertices), np.array(faces)
 
 
-def kinds(*placed, family=None, alike=None):
+def kinds(*placed, family=None, alike=None, pixels=None):
     vertices, faces = squares(*placed)
     count = len(placed)
     of_face = np.repeat(np.arange(count), 2).astype(np.int32)
-    rows = np.full(count, 2, np.int32), np.ones(count), np.ones((count, 3)), np.ones(count, np.int64)
+    rows = (
+        np.full(count, 2, np.int32),
+        np.ones(count),
+        np.ones((count, 3)),
+        np.array(np.ones(count) if pixels is None else pixels, int),
+    )
     groups = EmitterGroups(of_face, np.ones_like(of_face), *rows, [])
     family = np.arange(count) if family is None else np.array(family)
     return of_one_kind(groups, vertices, faces, family, np.ones(count, bool) if alike is None else np.array(alike)).tolist()
@@ -104,6 +109,7 @@ def test_panes_side_by_side_are_of_one_kind():
     gap = 0.9 * SIDE_BY_SIDE
     big, small = ([0, 0, 1], 1.0, 0), ([0, 0.5 + gap + 0.2, 1], 0.4, 0)
     assert kinds(big, small) == [0, 0]
+    assert kinds(big, small, pixels=[9, 0]) == [0, 1] and kinds(small, small, pixels=[9, 0]) == [0, 0]
     assert kinds(big, ([0, 0.5 + 1.2 * SIDE_BY_SIDE + 0.2, 1], 0.4, 0)) == [0, 1]
     assert kinds(big, ([1.1 * IN_PLANE, 0.7 + gap, 1], 0.4, 0)) == [0, 1]  # before it
     assert kinds(big, ([0.0, 0.7 + gap, 1], 0.4, 1)) == [0, 1]  # square to it

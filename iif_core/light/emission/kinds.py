@@ -35,18 +35,21 @@ def of_one_kind(
         groups: of F faces.
         vertices, faces: (n, 3), metres, and (F, 3).
         family: (G,) int.
-        alike: (G,) bool, groups that may be joined with others, as they look alike.
+        alike: (G,) bool, groups that may be joined with others, as they look alike. A pane that no camera sees is none: it may be
+            the wall beside a window.
 
     Returns:
         (G,) int >= 0, numbers of the families.
     """
     number = np.flatnonzero(alike)
+    are_seen = ~groups.is_hidden[number]
     pieces = [Piece.of(vertices, faces[groups.of_face == g]) for g in number]
     pairs = [
         (number[i], number[j])
         for j, second in enumerate(pieces)
         for i, first in enumerate(pieces[:j])
-        if first.is_in_plane_of(second) and (first.is_size_of(second) or first.is_next_to(second))
+        if first.is_in_plane_of(second)
+        and (first.is_size_of(second) or (are_seen[i] and are_seen[j] and first.is_next_to(second)))
     ]
     ends = np.array(pairs, np.int64).reshape(-1, 2)
     first = np.unique(family, return_index=True, return_inverse=True)
