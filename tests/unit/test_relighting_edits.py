@@ -519,6 +519,13 @@ def things():
     return Inventory(["wall", "window", "bulb", "bulb"], [Lamp(0, (1,)), Lamp(4, (2,)), Lamp(5, (3,))])
 
 
+def test_a_lamp_on_several_objects_is_called_as_it_is_shown():
+    room = Inventory(["wall", "pane", "frame"], [Lamp(0, (1, 2)), Lamp(1, (2,)), Lamp(2, ())])
+    assert [room.name_of(lamp) for lamp in room.lamps] == ["pane and 1 more", "frame", "lamp 2"]
+    assert room.lamps_called("pane and 1 more", "x") == [0] and room.lamps_called("pane", "x") == [0]
+    assert room.lamps_called("frame", "x") == [1]  # the one that is called so, and not all that are on it
+
+
 def test_lamps_are_called_by_object_or_id(things):
     assert things.lamps_called("window", "x") == [0] and things.lamps_called("4", "x") == [1]
     assert things.lamps_called("bulb", "x") == [1, 2]

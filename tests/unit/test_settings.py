@@ -54,6 +54,7 @@ def test_what_is_read_decides_where_specular_light_is_traced_and_how_noisy_diffu
         ("source: {kind: photographs, path: a, room_height: 2.6 m}", ["source.room_height", "'2.6 m'", "2.6"]),
         ("source: {kind: photographs, path: a, room_height: 260}", ["source.room_height", 260, "metres"]),
         ("source: {kind: folder, path: a, room_height: 2.6}", ["source.room_height", "`kind: photographs`"]),
+        ("source:\n  kind: folder\n  path:a\n", ["line", "space"]),
         ("source: {kind:folder, path: a}", ["kind: folder", "space"]),
         ("source:\n  kind:folder\n", ["source", "kind: folder", "space"]),
         ("source:\n  kind:folder\n  path: a\n", ["line 3", "space"]),

@@ -90,8 +90,14 @@ def test_the_worst_photograph_is_named():
 
 
 def test_held_out_scores_stand_next_to_those_of_the_other_photographs():
-    said = judge(dataclasses.replace(GOOD, others=28.4)).lights[2]
-    assert any("27.0" in finding.text and "28.4" in finding.text for finding in said.findings) and said.level == GREEN
+    said = judge(dataclasses.replace(GOOD, others=28.4, held_out_range=(23.5, 29.1))).lights[2]
+    assert any(not missing(finding.text, "27.0", "28.4", "23.5", "29.1") for finding in said.findings) and said.level == GREEN
+    alone = judge(dataclasses.replace(GOOD, held_out_views=1, held_out_range=(27.0, 27.0))).lights[2]
+    assert not any("27.0 to" in finding.text for finding in alone.findings)
+
+
+def missing(text, *words):
+    return [word for word in words if word not in text]
 
 
 def test_nothing_that_lights_the_room():

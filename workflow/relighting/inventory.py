@@ -24,8 +24,8 @@ MOST_EACH = 12
 
 @dataclass(frozen=True)
 class Lamp:
-    """An emitter that was kept: its id in emitters.parquet, the objects that its faces belong to, and its power, in W up to a
-    factor that all share."""
+    """An emitter that was kept: its id in emitters.parquet, the objects that its faces belong to, those with most of them first,
+    and its power, in W up to a factor that all share."""
 
     emitter_id: int
     objects: tuple[int, ...]
@@ -56,14 +56,18 @@ class Inventory:
         power = luminance(np.stack([table[f"radiance_{c}"] for c in "rgb"], 1)) * table["area_m2"] * sides
         for row in np.flatnonzero(table["kept"].astype(bool) & (table["kind"] == "area")):
             emitter = int(table["emitter_id"][row])
-            own = np.unique(object_id[faces["face_id"][faces["emitter_id"] == emitter]])
+            own, count = np.unique(object_id[faces["face_id"][faces["emitter_id"] == emitter]], return_counts=True)
+            own = own[np.argsort(-count, kind="stable")]
             lamps.append(Lamp(emitter, tuple(int(o) for o in own if o >= 0), float(power[row])))
         names = object_names(segmentation)
         return Inventory(names, lamps, renamed(names, wanted))
 
     def name_of(self, lamp: Lamp) -> str:
-        """Return the names of the objects that a lamp is on, or its number where it is on none."""
-        return " + ".join((self.shown or self.names)[o] for o in lamp.objects) or f"lamp {lamp.emitter_id}"
+        """Return the object that most of a lamp is on, and how many more it is on; or its number where it is on none."""
+        if not lamp.objects:
+            return f"lamp {lamp.emitter_id}"
+        more = f" and {len(lamp.objects) - 1} more" if len(lamp.objects) > 1 else ""
+        return f"{(self.shown or self.names)[lamp.objects[0]]}{more}"
 
     def is_called(self, number: int, key: str) -> bool:
         """Return whether a key of the settings is the name of an object, as people see it or as the segmentation gave it."""
@@ -71,7 +75,7 @@ class Inventory:
 
     def lamps_called(self, key: str, where: str) -> list[int]:
         """Return the places in `lamps` that a key of the settings means: one by its id (`emitter 5`, or `5` where no object is
-        called so), or all on objects of that name.
+        called so), one as `name_of` calls it, or all on objects of that name.
 
         Raises:
             InputError: there is no such lamp, or the object does not shine; `where` is the setting, for the message.
@@ -79,7 +83,8 @@ class Inventory:
         exact = re.fullmatch(r"emitter (\d+)", key)
         if exact and any(lamp.emitter_id == int(exact[1]) for lamp in self.lamps):
             return [i for i, lamp in enumerate(self.lamps) if lamp.emitter_id == int(exact[1])]
-        by_name = [i for i, lamp in enumerate(self.lamps) if any(self.is_called(o, key) for o in lamp.objects)]
+        called = [i for i, lamp in enumerate(self.lamps) if lamp.objects and key == self.name_of(lamp)]
+        by_name = called or [i for i, lamp in enumerate(self.lamps) if any(self.is_called(o, key) for o in lamp.objects)]
         found = by_name or [i for i, lamp in enumerate(self.lamps) if key == str(lamp.emitter_id)]
         if found:
             return found

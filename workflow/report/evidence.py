@@ -48,6 +48,7 @@ def evidence_of(scene: Reported) -> Evidence:
     unplaced = len(alone.get("left_out", ()))
     scored = psnr_of_views(scene.readers["metrics"].table("metrics.parquet"))
     worst = min(scored, key=lambda view: scored[view], default="")
+    aside = [scored[view.name] for view in scene.capture.views if view.split == "test" and view.name in scored]
     uncertainty = fitted.table("cells.parquet").get("uncertainty", ())
 
     def psnr(quantity: str) -> float | None:
@@ -82,6 +83,7 @@ def evidence_of(scene: Reported) -> Evidence:
         light_spread=found(means, "rgb", "raw", "light_spread").get("mean"),
         held_out=psnr("rgb_held_out"),
         others=found(means, "rgb_held_out", "raw", "psnr", "photo_mean").get("mean"),
+        held_out_range=(min(aside), max(aside)) if aside else None,
         held_out_views=int(found(means, "rgb_held_out", "raw", "psnr").get("views", 0)),
         used=psnr("rgb"),
         worst=(worst, scored[worst]) if worst else None,

@@ -129,7 +129,8 @@ class Evidence:
         misfit: of the light; light_spread: of the light against the truth.
         worst: the photograph whose re-rendering is worst, and its PSNR.
         held_out, used: PSNR of re-renderings of photographs that were held out, and that were used.
-        held_out_views: number of held-out photographs; others: PSNR of the mean of the other photographs on these.
+        held_out_views: number of held-out photographs; others: PSNR of the mean of the other photographs on these;
+            held_out_range: lowest and highest PSNR of them.
         albedo, roughness, metallic: PSNR against the truth, as they are; has_truth: whether there is truth.
         roughness_interval: half of the 95 % interval of roughness, median over the pixels; None if less than half have one.
         prior: kind of the prior.
@@ -164,6 +165,7 @@ class Evidence:
     held_out: float | None = None
     held_out_views: int = 0
     others: float | None = None
+    held_out_range: tuple[float, float] | None = None
     used: float | None = None
     worst: tuple[str, float] | None = None
     albedo: float | None = None
@@ -423,7 +425,8 @@ def _light(e: Evidence) -> Light:
         counted += ", each more likely bright surface"
     elif e.unlikely:
         one = "one of them is" if e.unlikely == 1 else f"{e.unlikely} of them are"
-        counted += f"; {one} more likely bright surface, with {percent(e.unlikely_power)} of their power"
+        # Where a lamp hangs, and whether the light needs it, tell less than how it outshines the room, which is judged below.
+        counted += f"; {one}, by place and need, more likely bright surface, with {percent(e.unlikely_power)} of their power"
     look = "Look at the list of lamps below, and photograph each lamp and window from several sides"
     if e.lamps > e.unlikely:
         level = min(LIMITS["unlikely_power"].level(e.unlikely_power), AMBER, key=ORDER.index)
@@ -472,9 +475,10 @@ def _materials(e: Evidence) -> Light:
     worst = "" if e.worst is None else f"; of all, {e.worst[0]} is worst with {e.worst[1]:.1f}"
     if e.held_out is not None:
         held = _counted(e.held_out_views, "held-out photograph")
+        ends = f" ({e.held_out_range[0]:.1f} to {e.held_out_range[1]:.1f})" if e.held_out_range and e.held_out_views > 1 else ""
         rival = "" if e.others is None else f", of which the mean of the other photographs has {e.others:.1f}"
         scored = _finding(
-            "rerendering", e.held_out, f"Re-renderings reach {{}} dB PSNR on {held}{rival}{worst}",
+            "rerendering", e.held_out, f"Re-renderings reach {{}} dB PSNR on {held}{ends}{rival}{worst}",
             _WORST_VIEWS, ".1f",
         )  # fmt: skip
     else:

@@ -118,6 +118,7 @@ def parse_yaml(text: str) -> Any:
 
 MISTAKES = {
     "found character '\\t'": "; YAML takes spaces, no tabs: replace them",
+    "could not find expected ':'": "; does a space follow each colon, on the line before as well?",
     "expected <block end>": "; is this line, or the one before, indented like its neighbours?",
     "mapping values are not allowed": "; is this line indented like its neighbours, and does a space follow each colon before it?"
     " A value with a colon needs quotes",

@@ -161,6 +161,8 @@ def _reason(dark: bool, reflecting: bool, excess: float, power: float) -> str:
     if dark:
         return "no emission is left for it"
     if reflecting:
+        if excess > 1.0:
+            return f"no clear lamp: {excess:.1f} times as bright as a white surface in its place, and not missed"
         white = f"{1 / excess:.0%} of" if excess > 0.1 else "more than ten times"
         return f"reflects: a white surface in its place would have {white} its brightness"
     return f"{power:.2%} of the light, and not missed"
