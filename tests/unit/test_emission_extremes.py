@@ -126,7 +126,7 @@ def test_emitter_that_is_never_seen_is_left_to_its_light():
     np.testing.assert_allclose(out.radiance, truth, rtol=0.05)
 
 
-@pytest.mark.parametrize("excess, said", [(2.0, "50%"), (0.5, "200%"), (1e-12, "ten"), (0.0, "ten")])
+@pytest.mark.parametrize("excess, said", [(2.0, "2.0 times"), (0.99, "101%"), (0.5, "200%"), (1e-12, "ten"), (0.0, "ten")])
 def test_reasons_are_numbers_that_people_read(excess, said):
     reason = _reason(False, True, excess, 0.01)
     assert said in reason and "0000" not in reason

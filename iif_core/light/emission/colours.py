@@ -38,7 +38,8 @@ def likely_colours(radiance: np.ndarray, error: np.ndarray, area: np.ndarray) ->
         return radiance.copy()
     found = np.asarray(radiance, np.float64)[lit]
     found = np.maximum(found, _DARKEST * found.max(1, keepdims=True))
-    relative = np.clip(np.nan_to_num(error[lit] / found, nan=_ERRORS[1]), *_ERRORS)
+    with np.errstate(over="ignore"):  # an error beyond all numbers is unknown, too
+        relative = np.clip(np.nan_to_num(error[lit] / found, nan=_ERRORS[1]), *_ERRORS)
 
     # -------- along each axis: the colour of each lamp, its error, and the mean of all --------
     colour, variance = np.log(found) @ AXES.T, relative**2 @ (AXES**2).T
