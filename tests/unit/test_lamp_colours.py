@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from iif_core.light.emission.colours import AXES, SPREAD, likely_colours
@@ -56,6 +56,8 @@ EXTREME = st.floats(0.0, 1e30)
 
 
 @given(st.lists(st.tuples(*[EXTREME] * 6, st.floats(0.0, 1e6)), min_size=1, max_size=6))
+@example([(0.0, 0.0, 5e-324, 0.0, 0.0, 0.0, 0.0)])
+@example([(1e30, 0.0, 0.0, 1e30, 1e30, 1e30, 1e6), (1e-99, 1e-320, 0.0, 0.0, 0.0, 1e30, 0.0)])
 def test_at_the_extremes(rows):
     """Always finite, never negative, as bright as before; white lamps stay so."""
     rows = np.array(rows)

@@ -10,6 +10,7 @@ AXES = np.array([[1.0, 0.0, -1.0], [-1.0, 2.0, -1.0]]) / np.sqrt([[2.0], [6.0]])
 SPREAD = np.array([0.5, 0.1])
 """Standard deviations of the lamps of a room along them: colour temperatures between 2700 and 6500 K spread by 0.5 along the
 first; along the second daylight and lamps differ by less than a tenth, what they shine through included."""
+_DARK = 1e-100  # radiance up to which a lamp has no colour
 _DARKEST = 1e-3  # of the brightest channel; darker ones have no logarithm
 _ERRORS = 1e-3, 3.0  # relative errors beyond which a channel is known, or unknown
 
@@ -33,10 +34,11 @@ def likely_colours(radiance: np.ndarray, error: np.ndarray, area: np.ndarray) ->
     Returns:
         (G, 3) radiance with the mean of the channels that it had; lamps that are dark stay so.
     """
-    lit = radiance.max(1, initial=0.0) > 0
+    out = np.array(radiance, np.float64)
+    lit = out.max(1, initial=0.0) > _DARK
     if not lit.any():
-        return radiance.copy()
-    found = np.asarray(radiance, np.float64)[lit]
+        return out
+    found = out[lit]
     found = np.maximum(found, _DARKEST * found.max(1, keepdims=True))
     with np.errstate(over="ignore"):  # an error beyond all numbers is unknown, too
         relative = np.clip(np.nan_to_num(error[lit] / found, nan=_ERRORS[1]), *_ERRORS)
@@ -49,7 +51,6 @@ def likely_colours(radiance: np.ndarray, error: np.ndarray, area: np.ndarray) ->
     mean = (weight * colour).sum(0) / (weight.sum(0) + 1.0 / prior)
     posterior = mean + prior / (prior + variance) * (colour - mean)
 
-    out = np.zeros(radiance.shape)
     likely = np.exp(posterior @ AXES)
-    out[lit] = likely * (radiance[lit].mean(1, keepdims=True) / likely.mean(1, keepdims=True))
+    out[lit] = likely * (out[lit].mean(1, keepdims=True) / likely.mean(1, keepdims=True))
     return out
