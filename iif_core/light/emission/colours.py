@@ -9,7 +9,7 @@ AXES = np.array([[1.0, 0.0, -1.0], [-1.0, 2.0, -1.0]]) / np.sqrt([[2.0], [6.0]])
 """Directions of the logarithm of a colour: from cold to warm, and from magenta to green."""
 SPREAD = np.array([0.5, 0.1])
 """Standard deviations of the lamps of a room along them: colour temperatures between 2700 and 6500 K spread by 0.5 along the
-first; along the second daylight and lamps differ by less than a tenth, what they shine through included."""
+first; along the second daylight and lamps differ by less than a tenth."""
 _DARK = 1e-100  # radiance up to which a lamp has no colour
 _DARKEST = 1e-3  # of the brightest channel; darker ones have no logarithm
 _ERRORS = 1e-3, 3.0  # relative errors beyond which a channel is known, or unknown

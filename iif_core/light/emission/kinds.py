@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,30 +44,26 @@ def of_one_kind(
     number = np.flatnonzero(alike)
     are_seen = ~groups.is_hidden[number]
     pieces = [Piece.of(vertices, faces[groups.of_face == g]) for g in number]
-    pairs = [
-        (number[i], number[j])
-        for j, second in enumerate(pieces)
-        for i, first in enumerate(pieces[:j])
-        if first.is_in_plane_of(second)
-        and (first.is_size_of(second) or (are_seen[i] and are_seen[j] and first.is_next_to(second)))
-    ]
-    ends = np.array(pairs, np.int64).reshape(-1, 2)
-    first = np.unique(family, return_index=True, return_inverse=True)
-    own = np.column_stack([np.arange(groups.size), first[1][first[2].ravel()]])
-    ends = np.concatenate([ends, own])
-    return component_labels(groups.size, ends[:, 0], ends[:, 1])
+    first, second = _pairs(pieces, lambda i, j, a, b: a.is_size_of(b) or (are_seen[i] and are_seen[j] and a.is_next_to(b)))
+    # Members of a family, with the first of it.
+    _, start, of = np.unique(family, return_index=True, return_inverse=True)
+    return component_labels(groups.size, np.r_[number[first], np.arange(groups.size)], np.r_[number[second], start[of.ravel()]])
 
 
 def side_by_side(pieces: Sequence[Piece]) -> np.ndarray:
     """Return (n,) int >= 0, one number for all pieces that lie side by side, as the panes of one window do."""
+    return component_labels(len(pieces), *_pairs(pieces, lambda i, j, a, b: a.is_next_to(b)))
+
+
+def _pairs(pieces: Sequence[Piece], belong: Callable[[int, int, Piece, Piece], bool]) -> np.ndarray:
+    """Return the numbers (2, k) of pieces of one plane that `belong` together, by their numbers and themselves."""
     pairs = [
         (i, j)
         for j, second in enumerate(pieces)
         for i, first in enumerate(pieces[:j])
-        if first.is_in_plane_of(second) and first.is_next_to(second)
+        if first.is_in_plane_of(second) and belong(i, j, first, second)
     ]
-    ends = np.array(pairs, np.int64).reshape(-1, 2)
-    return component_labels(len(pieces), ends[:, 0], ends[:, 1])
+    return np.array(pairs, np.int64).reshape(-1, 2).T
 
 
 @dataclass(frozen=True)
@@ -92,7 +88,7 @@ class Piece:
         return cls(vertices, faces, middle, float(area.sum()), radius, axis)
 
     def is_in_plane_of(self, other: Piece) -> bool:
-        """Both are flat enough to have a plane, and it is the same."""
+        """Most of both faces the same way, or the opposite one, and lies equally far along it."""
         return abs(self.normal @ other.normal) >= PARALLEL and abs((other.middle - self.middle) @ self.normal) <= IN_PLANE
 
     def is_size_of(self, other: Piece) -> bool:
