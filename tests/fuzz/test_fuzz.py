@@ -12,7 +12,7 @@ from iif_core.errors import InputError
 from tests.fuzz import runner
 from tests.fuzz.corpora import TARGETS, Target
 
-CASES = 500
+CASES = 300
 FAR_AWAY = Path(tempfile.gettempdir()) / f"harm-{os.getpid()}"
 REGRESSIONS = Path(__file__).with_name("regressions.tsv")
 """Seed, kind and number of cases that failed once, and how."""

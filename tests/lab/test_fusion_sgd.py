@@ -25,6 +25,7 @@ from tests.unit.test_fusion_direct import OBJECTS, SIZE, oracle_psnr, planted, p
 
 TERMS = ("data", "label", "regulariser", "entropy", "gain")
 QUICK = sgd_options(iterations=300, batch=4096)
+CASES = ("cells", 1), ("cells", 2), ("hashgrid", 1)
 SMALL_GRID = HashGridOptions(levels=6, log2_entries=12, base_resolution=8, growth=1.6, hidden=16)
 
 
@@ -256,8 +257,9 @@ def test_batches_are_permutations():
 # -------------------------------------------------------------------------------------------------------------- solver
 
 
-@pytest.mark.parametrize("texture", ["cells", "hashgrid"])
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize(
+    ("texture", "threads"), [("hashgrid", 2), *(pytest.param(*case, marks=pytest.mark.long) for case in CASES)]
+)
 def test_a_descent_goes_on_from_the_end_of_any_epoch(texture, threads):
     """The selection is fixed between the second and the third state, and the history is written between two of them."""
     problem, _ = simulated()

@@ -14,6 +14,7 @@ HELD = 0.9
 """Least share of the channels of all objects that 95 % intervals hold. There are a few hundred, three an object."""
 
 
+@pytest.mark.long
 def test_one_run_of_each_room(tmp_path_factory):
     folder = tmp_path_factory.mktemp("gates")
     done = run(folder, seeds=SEEDS[:1])

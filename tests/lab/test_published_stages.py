@@ -140,7 +140,7 @@ def test_a_killed_material_fit_goes_on_after_its_last_epoch(finished, tmp_path, 
     assert digests(resumed["affines"]) == digests(readers["affines"])
 
 
-@pytest.mark.parametrize("texture", ["cells", "hashgrid, hash_levels: 4, hash_entries: 10"])
+@pytest.mark.parametrize("texture", ["hashgrid, hash_levels: 4, hash_entries: 10", pytest.param("cells", marks=pytest.mark.long)])
 def test_a_killed_base_goes_on_after_its_last_epoch(finished, tmp_path, monkeypatch, texture):
     from lab.published.fusion.sgd import engine
     from lab.published.stages import base

@@ -237,7 +237,7 @@ def test_the_bend_has_its_size_and_correlation():
     normal, area = face_geometry(vertices, faces)
     middle = vertices[faces].mean(1)
     at, ratio = rng(8).uniform(0, 3, (2000, 3)), []
-    for seed in range(40):
+    for seed in range(20):
         bend = scanned.drawn_bend(vertices, faces, rng(seed))
         along = np.abs((bend(middle) * normal).sum(1))
         order = np.argsort(along)

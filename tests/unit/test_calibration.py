@@ -197,8 +197,18 @@ def test_unknown_exposures_give_the_curve_up_to_a_power(truth, limit):
     assert error < limit
 
 
-@pytest.mark.parametrize("power", [0.8, 1.25])
-@pytest.mark.parametrize("families", [CANDIDATES, ("ggcm",)], ids=["all", "one"])
+LONG = pytest.mark.long
+
+
+@pytest.mark.parametrize(
+    ("power", "families"),
+    [
+        pytest.param(0.8, CANDIDATES, id="0.8 all"),
+        pytest.param(1.25, ("ggcm",), id="1.25 one"),
+        pytest.param(1.25, CANDIDATES, id="1.25 all", marks=LONG),
+        pytest.param(0.8, ("ggcm",), id="0.8 one", marks=LONG),
+    ],
+)
 def test_stated_exposures_tell_the_power(power, families):
     """The camera's curve is sRGB of a power of the radiance, which photographs alone take for sRGB. Files state exposures within
     5 %."""
@@ -247,7 +257,7 @@ def _gains_of(rows):
     return estimate(gain_rows(rows, response("srgb")).thinned(), 8, white_balance=False).exposure
 
 
-@pytest.mark.parametrize("power", [1.1, 0.9])
+@pytest.mark.parametrize("power", [1.1, pytest.param(0.9, marks=LONG)])
 def test_curve_and_exposures_have_one_power_whatever_family_is_chosen(power):
     """Few, noisy rows, for which sRGB is good enough: it gets the power too."""
     srgb = response("srgb")
