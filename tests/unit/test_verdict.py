@@ -90,9 +90,9 @@ def test_the_worst_photograph_is_named():
 
 
 def test_held_out_scores_stand_next_to_those_of_the_other_photographs():
-    said = judge(dataclasses.replace(GOOD, others=28.4, held_out_range=(23.5, 29.1))).lights[2]
+    said = judge(dataclasses.replace(GOOD, others=28.4, held_out_each=(23.5, 29.1, 27.0, 28.4))).lights[2]
     assert any(not missing(finding.text, "27.0", "28.4", "23.5", "29.1") for finding in said.findings) and said.level == GREEN
-    alone = judge(dataclasses.replace(GOOD, held_out_views=1, held_out_range=(27.0, 27.0))).lights[2]
+    alone = judge(dataclasses.replace(GOOD, held_out_views=1, held_out_each=(27.0,))).lights[2]
     assert not any("27.0 to" in finding.text for finding in alone.findings)
 
 
@@ -147,6 +147,13 @@ def test_the_score_of_held_out_photographs_counts_before_that_of_the_others():
     assert changed(held_out=15.0, used=30.0)["materials"] == RED
     assert changed(held_out=30.0, used=17.0)["materials"] == GREEN
     assert changed(held_out=None, used=15.0)["materials"] == RED
+
+
+def test_one_good_photograph_does_not_make_up_for_most():
+    """20.0 dB in the mean of 19.1, 19.2 and 21.9 is below the limit of 20 for most of them, and so is a mean that one spoils."""
+    assert changed(held_out=20.1, held_out_each=(19.1, 19.2, 21.9), held_out_views=3)["materials"] == AMBER
+    assert changed(held_out=20.1, held_out_each=(18.0, 20.9, 21.4), held_out_views=3)["materials"] == GREEN
+    assert changed(held_out=19.5, held_out_each=(15.0, 21.0, 22.5), held_out_views=3)["materials"] == AMBER
 
 
 def test_without_truth_something_must_be_held_out():

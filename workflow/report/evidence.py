@@ -83,7 +83,7 @@ def evidence_of(scene: Reported) -> Evidence:
         light_spread=found(means, "rgb", "raw", "light_spread").get("mean"),
         held_out=psnr("rgb_held_out"),
         others=found(means, "rgb_held_out", "raw", "psnr", "photo_mean").get("mean"),
-        held_out_range=(min(aside), max(aside)) if aside else None,
+        held_out_each=aside,
         held_out_views=int(found(means, "rgb_held_out", "raw", "psnr").get("views", 0)),
         used=psnr("rgb"),
         worst=(worst, scored[worst]) if worst else None,
