@@ -25,6 +25,7 @@ from workflow.runtime import fingerprint
 from workflow.runtime.job import run_stage
 from workflow.sources import photographs
 from workflow.sources.folder_scene import frames, images, inputs, transforms
+from workflow.stages.reconstruction import scale_notes
 
 SIZE = np.array([4.0, 3.0, 2.6])
 CAMERA = Pinhole(260.0, 260.0, 160.0, 120.0, 320, 240)
@@ -141,6 +142,15 @@ def test_known_cameras_give_the_room(tmp_path, monkeypatch):
         assert (face >= 0).mean() > 0.98
         assert np.median(np.abs(depth / shown - 1)[face >= 0]) < 0.02
     assert any("source.room_height" in note for note in capture.facts["notes"])
+
+
+@pytest.mark.parametrize(
+    ("height", "held", "is_odd"), [(2.6, 1.4, False), (8.5, 4.7, True), (0.8, 0.45, True), (6.0, 2.4, False)]
+)
+def test_a_height_in_feet_is_doubted(height, held, is_odd):
+    (said, *more) = scale_notes("room_height", height, held, None)
+    assert f"{height:g} m" in said and f"{held:g} m" in said
+    assert [note.startswith("WARNING") and "source.room_height" in note for note in more] == [True] * is_odd
 
 
 @pytest.mark.long

@@ -43,6 +43,8 @@ MANY = 0.1
 """Share of photographs without a camera from which a person is warned."""
 LEAST_CONFIRMED = 0.1
 """Least share of all pixels whose depth others confirm."""
+HELD = 0.5, 2.5
+"""Metres above the floor between which people hold cameras."""
 VOXELS = 2.0
 """Edge of a voxel in sizes of a pixel on the surface (median)."""
 
@@ -206,6 +208,22 @@ def _metres(source: Any, frame: RoomFrame, sparse: Sparse) -> tuple[float, str]:
     return source.camera_height / max(float(np.median(heights)), 1e-12), "camera_height"
 
 
+def scale_notes(basis: str, tall: float, held: float, frame: RoomFrame) -> list[str]:
+    """Say by what the metre is known, and whether it can be right: the room is `tall`, and cameras are `held` (median) above its
+    floor, metres."""
+    if basis == "camera_height":
+        above = "floor" if frame.has_floor else "lowest surface, because no floor was found"
+        better = "; source.room_height, from floor to ceiling, is better" if frame.has_floor and frame.has_ceiling else ""
+        return [f"scale: guessed, from cameras that are held at source.camera_height above the {above}{better}"]
+    said = [f"scale: the room is {tall:.3g} m high (source.room_height), and the cameras are {held:.2g} m above its floor"]
+    if not HELD[0] <= held <= HELD[1]:
+        said.append(
+            f"WARNING cameras {held:.2g} m above the floor are no cameras in hands: is source.room_height in metres, and of this"
+            " room?"
+        )
+    return said
+
+
 def _facts(
     sparse: Sparse,
     frame: RoomFrame,
@@ -230,6 +248,7 @@ def _facts(
     ]
     known = walls.error[np.isfinite(walls.error)]
     tall = walls.height() or (frame.ceiling - frame.floor) * scale
+    held = float(np.median(sparse.world_from_camera[:, 2, 3]))
     notes = [
         f"cameras and mesh were found from the photographs: {len(sparse.names)} have a camera, {faces} faces, voxels of"
         f" {1000 * voxel:.3g} mm; depth that several confirm on {np.mean(shares['depth_share']):.0%} of the pixels, on"
@@ -237,12 +256,7 @@ def _facts(
         f"flat sides, floor and ceiling included, take the place of {found.sum():.3g} m2 of surface"
         + (f" that lies within {1000 * known.max():.2g} mm of them (standard deviation)" if len(known) else "")
         + f", and {built.sum():.3g} m2 are built where photographs show no texture",
-        {
-            "room_height": f"scale: the room is {tall:.3g} m high (source.room_height)",
-            "camera_height": "scale: guessed, from cameras that are held at source.camera_height above the "
-            + ("floor" if frame.has_floor else "lowest surface, because no floor was found")
-            + ("; source.room_height, from floor to ceiling, is better" if frame.has_floor and frame.has_ceiling else ""),
-        }[basis],
+        *scale_notes(basis, tall, held, frame),
     ]
     if len(known) <= CLOSES * count:
         notes.append(
