@@ -167,7 +167,7 @@ def texel_errors(job: Any, stored: Any, asked: argparse.Namespace) -> list[dict[
 
     recovered = read_recovered(job)
     parts = read_parts(job.read("unwrap"), recovered)
-    lamps = find_lamps(parts, recovered.emitter_radiance, recovered.light.environment)
+    lamps = find_lamps(parts, recovered.emitter_radiance, recovered.light.environment, recovered.emitter_names)
     texels = lit_texels(parts, stored.document["light"]["size"])
     atlas = bake(parts, recovered, job.read("affines").table("cells.parquet")["uncertainty"], stored.document["light"]["size"])
     lit = lit_scene(parts, recovered.surface, lamps)

@@ -114,6 +114,7 @@ def room(lamp=(9.0, 6.0, 3.0), environment=(0, 0, 0), lamp_side=1):
         light=light,
         emitter_id=emitter,
         emitter_radiance=np.array([lamp], np.float32),
+        emitter_names=["ceiling light 1"],
         light_scale=1.0,
     )
 
@@ -439,6 +440,7 @@ def test_a_simplified_ball_looks_round_by_its_normal_map(tmp_path):
         light=dark,
         emitter_id=np.full(count, -1, np.int32),
         emitter_radiance=np.zeros((0, 3)),
+        emitter_names=[],
         light_scale=1.0,
     )
     (coarse,) = build_parts(seen(scene, front=(9,), back=(0,)), 200)

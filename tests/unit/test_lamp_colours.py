@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from iif_core.light.emission.colours import AXES, SPREAD, likely_colours
 from iif_core.light.emission.groups import EmitterGroups
-from iif_core.light.emission.kinds import IN_PLANE, LARGEST, SAME_SIZE, SIDE_BY_SIDE, of_one_kind
+from iif_core.light.emission.kinds import IN_PLANE, LARGE, LARGEST, SAME_SIZE, SIDE_BY_SIDE, Piece, of_one_kind, place_names
 
 ONE = np.ones(1)
 
@@ -115,6 +115,38 @@ def test_panes_side_by_side_are_of_one_kind():
     assert kinds(big, ([0, 0.5 + 1.2 * SIDE_BY_SIDE + 0.2, 1], 0.4, 0)) == [0, 1]
     assert kinds(big, ([1.1 * IN_PLANE, 0.7 + gap, 1], 0.4, 0)) == [0, 1]  # before it
     assert kinds(big, ([0.0, 0.7 + gap, 1], 0.4, 1)) == [0, 1]  # square to it
+
+
+def called(*placed, overhead=(), unseen=(), power=None):
+    pieces = [Piece.of(*squares(one)) for one in placed]
+    number = np.arange(len(placed))
+    power = np.ones(len(placed)) if power is None else np.array(power)
+    return place_names(pieces, np.array([0, 0, 1.0]), np.isin(number, overhead), np.isin(number, unseen), power)
+
+
+def test_lamps_are_called_by_where_they_are_the_strongest_first():
+    spot, other, pane, beside = ([0, 0, 3], 0.2, 2), ([2, 0, 3], 0.2, 2), ([0, 0, 1], 0.4, 0), ([0, 0.5, 1], 0.4, 0)
+    assert called(spot, other, pane, beside, overhead=[0, 1], power=[1, 3, 1, 1]) == [
+        "ceiling light 2",
+        "ceiling light 1",
+        "window 1",
+        "window 1",
+    ]
+    edge = np.sqrt(LARGE)
+    assert called(([0, 0, 1], 1.01 * edge, 0), ([5, 0, 1], 0.99 * edge, 0)) == ["window 1", "lamp 1"]
+    assert called(([0, 0, 1], 2 * edge, 2)) == ["lamp 1"]  # a table
+    assert called(pane, beside, unseen=[1]) == ["lamp 1", "unseen lamp 1"]
+    assert called(pane, beside, overhead=[0]) == ["ceiling light 1"] * 2  # a panel that hangs
+    assert called() == []
+
+
+def test_a_lamp_all_around_is_no_window():
+    """A cube of 1 m, and a pane of which a tenth is bent."""
+    cube = [([0.5 * (axis == k) * side + 0.0 for k in range(3)], 1.0, axis) for axis in range(3) for side in (-1, 1)]
+    lamp = Piece.of(*squares(*cube))
+    assert not lamp.is_flat
+    assert place_names([lamp], np.array([0, 0, 1.0]), np.zeros(1, bool), np.zeros(1, bool), np.ones(1)) == ["lamp 1"]
+    assert Piece.of(*squares(([0, 0, 1], 0.9, 0), ([0, 0.5, 1], 0.3, 1))).is_flat
 
 
 def test_only_what_looks_alike_is_joined_and_families_stay_together():

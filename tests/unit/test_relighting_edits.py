@@ -526,6 +526,15 @@ def test_a_lamp_on_several_objects_is_called_as_it_is_shown():
     assert room.lamps_called("frame", "x") == [1]  # the one that is called so, and not all that are on it
 
 
+def test_the_panes_of_a_window_are_called_together():
+    """Also where an object has the name of a lamp that is on another one."""
+    lamps = [Lamp(0, (1,), 1.0, "window 1"), Lamp(1, (2,), 1.0, "window 1"), Lamp(4, (3,), 1.0, "lamp 1")]
+    room = Inventory(["wall", "pane", "pane", "window 1"], lamps)
+    assert room.lamps_called("window 1", "x") == [0, 1] and room.lamps_called("lamp 1", "x") == [2]
+    with refused("relight.lamps", "'window 2'", "'window 1'", "window 1 (pane), window 1 (pane), lamp 1 (window 1)"):
+        room.lamps_called("window 2", "relight.lamps")
+
+
 def test_lamps_are_called_by_object_or_id(things):
     assert things.lamps_called("window", "x") == [0] and things.lamps_called("4", "x") == [1]
     assert things.lamps_called("bulb", "x") == [1, 2]

@@ -186,6 +186,7 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     writer = scene.plant("emission")
     rows = {
         "emitter_id": np.array([0, 1]),
+        "name": ["ceiling light 1", "walls"],
         "kind": ["area", "area"],
         "faces": np.array([2, 0]),
         "area_m2": np.array([0.6, 0.1]),

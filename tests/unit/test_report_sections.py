@@ -135,10 +135,17 @@ def test_the_headline_says_if_the_fit_made_albedo_worse(base, worse):
 
 
 def test_lamps_are_told_by_their_power():
-    table = {"emitter_id": [4, 5, 6], "object": ["a", "b", "c"], "kind": ["area", "area", "environment"], "faces": [1, 2, 0]}
-    table |= {"side": [1, 0, 1], "area_m2": [1.0, 1.0, 0.0], "observations": [1, 2, 3], "kept": [True, True, True]}
+    table = {"emitter_id": [4, 5, 6], "name": list("xyz"), "object": list("abc"), "kind": ["area", "area", "environment"]}
+    table |= {
+        "faces": [1, 2, 0],
+        "side": [1, 0, 1],
+        "area_m2": [1.0, 1.0, 0.0],
+        "observations": [1, 2, 3],
+        "kept": [True, True, True],
+    }
     table |= {f"radiance_{c}": [2.0, 3.0, 9.0] for c in "rgb"} | {f"error_{c}": [0.1] * 3 for c in "rgb"}
     rows = emitter_rows({name: np.array(column) for name, column in {**table, "reason": [""] * 3}.items()})
+    assert [row["name"] for row in rows] == ["y", "x", "z"]
     assert [(row["id"], row["share"]) for row in rows] == [(5, "75.0 %"), (4, "25.0 %"), (6, "–")]  # both sides of b shine
     assert {row["probability"] for row in rows} == {"–"}  # light of another solver
     table |= {"reason": [""] * 3, "probability": [0.932, 0.051, -1.0]}

@@ -78,34 +78,33 @@ def surface(parts):
 def test_every_emitter_is_a_lamp_up_to_sixteen():
     many = [part(quad((0, 0, 2 + i), (0, 1, 0), (1, 0, 0)), i, 20, f"lamp.emitter{i}", i, i) for i in range(20)]
     radiance = np.linspace(1, 20, 20)[:, None] * np.float32([1, 0.5, 0.25])
-    few = find_lamps(many[:3], radiance[:3], np.float32([0.1, 0.2, 0.4]))
-    assert [one.name for one in few.lamps] == ["lamp, emitter 0", "lamp, emitter 1", "lamp, emitter 2", "light from outside"]
+    names = [f"lamp {i}" for i in range(20)]
+    few = find_lamps(many[:3], radiance[:3], np.float32([0.1, 0.2, 0.4]), names)
+    assert [one.name for one in few.lamps] == ["lamp 0", "lamp 1", "lamp 2", "light from outside"]
     np.testing.assert_allclose([one.color for one in few.lamps], [[1, 0.5, 0.25]] * 3 + [[0.25, 0.5, 1]])
     np.testing.assert_allclose(few.radiance, radiance[:3, :1].repeat(3, 1))  # white while it is traced
     assert few.environment == 3 and few.surroundings.ravel().tolist() == pytest.approx([0.4] * 3)
     sun = np.float32([[[1, 2, 3], [0, 0, 0]], [[0, 0, 0], [0, 0, 9]]])
-    all_of_them = find_lamps(many, radiance, sun)
+    all_of_them = find_lamps(many, radiance, sun, names)
     assert len(all_of_them.lamps) == 16 and all_of_them.environment == 15
     shared = all_of_them.lamps[14]
     assert shared.emitters == tuple(range(6)) and shared.color.tolist() == [1, 1, 1]
     np.testing.assert_allclose(all_of_them.radiance[:6], radiance[:6])  # with their own colours
     np.testing.assert_array_equal(all_of_them.surroundings, sun)
-    assert find_lamps([], np.zeros((0, 3)), np.zeros(3)).lamps == []
+    assert find_lamps([], np.zeros((0, 3)), np.zeros(3), []).lamps == []
 
 
 def test_panes_of_a_window_are_one_lamp():
-    """Two panes with a bar of 10 cm between them, in two colours, and a lamp elsewhere; one of the panes is dark in another."""
+    """Two panes of one name, in two colours, and a lamp; one of the panes is dark in another."""
     places = ((0, 0, 1), (0, 1.1, 1), (3, 0, 2))
     many = [part(quad(place, (0, 1, 0), (0, 0, 1)), i, 3, f"pane {i}.emitter{i}", i, i) for i, place in enumerate(places)]
     radiance = np.float32([[1, 2, 3], [4, 4, 4], [1, 1, 1]])
-    found = find_lamps(many, radiance, np.zeros(3))
-    assert [(one.name, one.emitters) for one in found.lamps] == [
-        ("pane 1, emitter 1 and 1 beside it", (0, 1)),
-        ("pane 2, emitter 2", (2,)),
-    ]
+    names = ["window 1", "window 1", "lamp 1"]
+    found = find_lamps(many, radiance, np.zeros(3), names)
+    assert [(one.name, one.emitters) for one in found.lamps] == [("window 1", (0, 1)), ("lamp 1", (2,))]
     np.testing.assert_allclose(found.radiance[:2], radiance[:2])  # each with its own colour
     assert found.of_emitter.tolist() == [0, 0, 1]
-    alone = find_lamps(many, radiance * [[0], [1], [1]], np.zeros(3))
+    alone = find_lamps(many, radiance * [[0], [1], [1]], np.zeros(3), names)
     assert [one.emitters for one in alone.lamps] == [(1,), (2,)] and alone.of_emitter.tolist() == [-1, 0, 1]
 
 
@@ -182,7 +181,7 @@ def test_a_lamp_of_a_million_is_stored_and_solids_cast_no_rims(llvm, parts, surf
     maps = {}
     for strength in (1.0, 1e6 / 8):
         lamp = replace(parts[2], radiance=np.float32([8, 4, 2]) * np.float32(strength))
-        lamps = find_lamps([*parts[:2], lamp], lamp.radiance[None], np.zeros(3))
+        lamps = find_lamps([*parts[:2], lamp], lamp.radiance[None], np.zeros(3), ["lamp"])
         light = trace_lamps([*parts[:2], lamp], texels, surface, lamps, 32, 8, 1, denoised=False)
         halves = to_half(light)
         assert np.isfinite(halves.value).all()
@@ -196,7 +195,7 @@ def test_a_lamp_of_a_million_is_stored_and_solids_cast_no_rims(llvm, parts, surf
 
 def test_no_lamp_is_a_dark_page(parts, surface):
     texels = lit_texels(parts, 32)
-    lamps = find_lamps(parts[:2], np.zeros((0, 3)), np.zeros(3))
+    lamps = find_lamps(parts[:2], np.zeros((0, 3)), np.zeros(3), [])
     light = trace_lamps(parts, texels, surface, lamps, 8, 4, 1)
     assert light.shape == (len(texels.index), 0, 3)
     blobs = build.light_blobs(to_half(light), texels)

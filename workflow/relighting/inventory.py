@@ -25,11 +25,12 @@ MOST_EACH = 12
 @dataclass(frozen=True)
 class Lamp:
     """An emitter that was kept: its id in emitters.parquet, the objects that its faces belong to, those with most of them first,
-    and its power, in W up to a factor that all share."""
+    its power, in W up to a factor that all share, and its name by where it is, which the panes of a window share."""
 
     emitter_id: int
     objects: tuple[int, ...]
     power: float = 0.0
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class Inventory:
             emitter = int(table["emitter_id"][row])
             own, count = np.unique(object_id[faces["face_id"][faces["emitter_id"] == emitter]], return_counts=True)
             own = own[np.argsort(-count, kind="stable")]
-            lamps.append(Lamp(emitter, tuple(int(o) for o in own if o >= 0), float(power[row])))
+            lamps.append(Lamp(emitter, tuple(int(o) for o in own if o >= 0), float(power[row]), str(table["name"][row])))
         names = object_names(segmentation)
         return Inventory(names, lamps, renamed(names, wanted))
 
@@ -75,7 +76,7 @@ class Inventory:
 
     def lamps_called(self, key: str, where: str) -> list[int]:
         """Return the places in `lamps` that a key of the settings means: one by its id (`emitter 5`, or `5` where no object is
-        called so), one as `name_of` calls it, or all on objects of that name.
+        called so), all of that name (`window 1`), one as `name_of` calls it, or all on objects of that name.
 
         Raises:
             InputError: there is no such lamp, or the object does not shine; `where` is the setting, for the message.
@@ -83,16 +84,18 @@ class Inventory:
         exact = re.fullmatch(r"emitter (\d+)", key)
         if exact and any(lamp.emitter_id == int(exact[1]) for lamp in self.lamps):
             return [i for i, lamp in enumerate(self.lamps) if lamp.emitter_id == int(exact[1])]
-        called = [i for i, lamp in enumerate(self.lamps) if lamp.objects and key == self.name_of(lamp)]
+        placed = [i for i, lamp in enumerate(self.lamps) if lamp.name == key]
+        called = placed or [i for i, lamp in enumerate(self.lamps) if lamp.objects and key == self.name_of(lamp)]
         by_name = called or [i for i, lamp in enumerate(self.lamps) if any(self.is_called(o, key) for o in lamp.objects)]
         found = by_name or [i for i, lamp in enumerate(self.lamps) if key == str(lamp.emitter_id)]
         if found:
             return found
-        there = ", ".join(f"{lamp.emitter_id} ({self.name_of(lamp)})" for lamp in self.lamps[:8]) or "none"
-        hint = did_you_mean(key, [(self.shown or self.names)[o] for lamp in self.lamps for o in lamp.objects], "{!r}")
+        there = ", ".join(f"{lamp.name or lamp.emitter_id} ({self.name_of(lamp)})" for lamp in self.lamps[:8]) or "none"
+        known = [(self.shown or self.names)[o] for lamp in self.lamps for o in lamp.objects]
+        hint = did_you_mean(key, [*known, *(lamp.name for lamp in self.lamps if lamp.name)], "{!r}")
         is_there = any(self.is_called(o, key) for o in range(len(self.names)))
         what = f"object {key!r} does not shine" if is_there else f"there is no lamp {key!r}"
-        raise InputError(f"{where}: {what}.{hint} Lamps of this room: {there}; ids are in emitters.parquet")
+        raise InputError(f"{where}: {what}.{hint} Lamps of this room: {there}; the report lists them")
 
     def expanded(self, entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
         """Return dumped relightings, those with `each` as one for each of the strongest lamps, the strongest first."""

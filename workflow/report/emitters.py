@@ -30,6 +30,7 @@ def emitter_rows(table: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
         rows.append(
             {
                 "id": int(table["emitter_id"][i]),
+                "name": str(table["name"][i]),
                 "object": str(table["object"][i]),
                 "kind": str(table["kind"][i]),
                 "faces": int(table["faces"][i]),

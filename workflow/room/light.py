@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from iif_core.light.base_scene import BaseScene
-from iif_core.light.emission.kinds import Piece, side_by_side
 from iif_core.light.environment import as_map, solid_angles
 from iif_core.light.light_maps import MOST_LAMPS, NORMAL_REACH, group_lamps, smooth, with_mean_of
 from iif_core.numerics.color import id_colours, luminance
@@ -82,28 +81,29 @@ class Lamps:
     surroundings: Array
 
 
-def find_lamps(parts: Sequence[TexturedPart], radiance: Array, environment: Array) -> Lamps:
-    """List the lamps of a scene: one for each emitter, but for panes of one window; the weakest together beyond `MOST_LAMPS`; the
-    environment last.
+def find_lamps(parts: Sequence[TexturedPart], radiance: Array, environment: Array, names: Sequence[str]) -> Lamps:
+    """List the lamps of a scene: one for all emitters of one name, such as the panes of a window; the weakest together beyond
+    `MOST_LAMPS`; the environment last.
 
     Args:
         parts: of the surface; the areas of emitters come from them.
         radiance: (E, 3) of each emitter id.
         environment: (3,), or (H, W, 3) as in `iif_core.light.environment`.
+        names: (E,) of the emitters.
     """
-    area, names = np.zeros(len(radiance)), [""] * len(radiance)
+    area = np.zeros(len(radiance))
     for part in parts:
         if part.emitter_id >= 0:
             sides = 2 if part.double_sided else 1
             area[part.emitter_id] += sides * face_geometry(part.vertices, part.faces)[1].sum()
-            names[part.emitter_id] = names[part.emitter_id] or part.name.replace(".emitter", ", emitter ")
     radiance = np.asarray(radiance, np.float64).reshape(-1, 3)
     power = np.pi * area * radiance.mean(1)
     outside = as_map(environment)
     shines = bool(outside.any())
-    window = _windows(parts, power)
-    of_window, count = group_lamps(np.bincount(window, power), MOST_LAMPS - shines)
-    of_emitter = np.where(power > 0, of_window[window], -1).astype(np.int32)
+    called = [names[e] if power[e] > 0 else f"{e} is dark" for e in range(len(power))]
+    first, named = np.unique(called, return_index=True, return_inverse=True)[1:]
+    of_name, count = group_lamps(np.bincount(first[named.ravel()], power, len(power)), MOST_LAMPS - shines)
+    of_emitter = np.where(power > 0, of_name[first[named.ravel()]], -1).astype(np.int32)
     lamps, traced = [], np.zeros_like(radiance)
     for number in range(count):
         own = np.flatnonzero(of_emitter == number)
@@ -111,9 +111,8 @@ def find_lamps(parts: Sequence[TexturedPart], radiance: Array, environment: Arra
         mean = (power[own, None] * radiance[own]).sum(0) / total
         color = _color(radiance[own[0]]) if len(own) == 1 else np.ones(3)
         traced[own] = radiance[own].max(1, keepdims=True) if len(own) == 1 else radiance[own]
-        first = names[own[power[own].argmax()]]
-        panes = first if len(own) == 1 else f"{first} and {len(own) - 1} beside it"
-        name = panes if len(set(window[own])) == 1 else f"{len(own)} weak emitters together"
+        own_names = {names[e] for e in own}
+        name = own_names.pop() if len(own_names) == 1 else f"{len(own)} weak emitters together"
         lamps.append(Lamp(name, tuple(int(e) for e in own), color, mean, float(total)))
     if shines:
         even = outside.shape[:2] == (1, 1)
@@ -121,21 +120,6 @@ def find_lamps(parts: Sequence[TexturedPart], radiance: Array, environment: Arra
         lamps.append(Lamp("light from outside", (), _color(mean) if even else np.ones(3), mean, 0.0))
         outside = np.full_like(outside, outside.max()) if even else outside
     return Lamps(lamps, of_emitter, traced.astype(np.float32), len(lamps) - 1 if shines else -1, outside)
-
-
-def _windows(parts: Sequence[TexturedPart], power: Array) -> Array:
-    """Number the emitters (E,) of some `power` (E,): those that lie side by side have one number."""
-    shining = np.flatnonzero(power > 0)
-    pieces = []
-    for emitter in shining:
-        own = [part for part in parts if part.emitter_id == emitter]
-        first = np.cumsum([0, *(len(part.vertices) for part in own)])
-        faces = np.concatenate([part.faces + start for part, start in zip(own, first, strict=False)])
-        pieces.append(Piece.of(np.concatenate([part.vertices for part in own]), faces))
-    together = side_by_side(pieces)
-    out = np.arange(len(power))
-    out[shining] = shining[np.unique(together, return_index=True)[1][together]]  # the first of each
-    return out
 
 
 def backdrop(radiance: Array, seen: Array | None) -> Array:

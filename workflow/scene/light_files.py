@@ -34,17 +34,20 @@ def emitter_columns(
     kind: list[str] | None = None,
     side: np.ndarray | None = None,
     evidence: LampEvidence | None = None,
+    name: list[str] | None = None,
 ) -> dict[str, Any]:
     """Return the columns of emitters.parquet for n emitters: `faces`, `area` (m^2), `observations`, `kept`, `reason` and `side`
-    (n,), `radiance` and `error` (n, 3); `kind`: None = all are faces; `evidence`: of the first of them, None = of none."""
+    (n,), `radiance` and `error` (n, 3); `kind`: None = all are faces; `evidence`: of the first of them, None = of none; `name`:
+    None = numbers."""
     n = len(faces)
-    told = {"probability": np.full(n, UNKNOWN), "needed": np.zeros(n)}
+    told = {"probability": np.full(n, UNKNOWN), "needed": np.zeros(n), "brightness": np.zeros(n)}
     told |= {name: np.zeros(n, bool) for name in ("is_likely", "is_saturated", "is_hidden")}
     if evidence is not None:
         for name, values in told.items():
             values[: len(evidence.needed)] = getattr(evidence, name)
     return {
         "emitter_id": np.arange(n, dtype=np.int32),
+        "name": np.array([f"lamp {i}" for i in range(n)] if name is None else name, dtype=str),
         "kind": np.array(["area"] * n if kind is None else kind, dtype=str),
         "faces": np.asarray(faces, np.int32),
         "area_m2": np.asarray(area, np.float64),
@@ -125,6 +128,7 @@ def _table(light: FoundLight) -> dict[str, Any]:
         kind=["area"] * groups.size + ["environment"] * outside + ["area"] * out,
         side=np.array([*sides[0], *[0] * outside, *sides[1]]),
         evidence=light.evidence,
+        name=[*light.names, *["light from outside"] * outside, *light.left_on],
     )
 
 

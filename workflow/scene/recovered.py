@@ -27,6 +27,7 @@ class Recovered:
         light: per face, with the light scale.
         emitter_id: (m,) kept emitter of each face.
         emitter_radiance: (emitters, 3) per emitter id, with the light scale; 0 for dropped ones and environments.
+        emitter_names: per emitter id, for people.
         light_scale: factor on the radiance of stage emission that makes it consistent with the fitted albedo.
     """
 
@@ -36,6 +37,7 @@ class Recovered:
     light: Light
     emitter_id: np.ndarray
     emitter_radiance: np.ndarray
+    emitter_names: list[str]
     light_scale: float
 
     def emission_map(self, face_id: np.ndarray, eye: np.ndarray) -> np.ndarray:
@@ -78,6 +80,7 @@ def read_recovered(job: Job) -> Recovered:
         light=light,
         emitter_id=emitter_id,
         emitter_radiance=radiance,
+        emitter_names=emitters["name"].tolist(),
         light_scale=scale,
     )
 

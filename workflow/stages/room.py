@@ -39,7 +39,7 @@ def run(job: Job) -> None:
         parts = read_parts(job.read("unwrap"), recovered)
         uncertainty = job.read("affines").table("cells.parquet", ("uncertainty",))["uncertainty"]
         atlas = bake(parts, recovered, uncertainty, job.read("unwrap").json("unwrap.json")["size"])
-        lamps = find_lamps(parts, recovered.emitter_radiance, recovered.light.environment)
+        lamps = find_lamps(parts, recovered.emitter_radiance, recovered.light.environment, recovered.emitter_names)
         size = build.lightmap_size(wanted.lightmap_size, len(lamps.lamps), FILL, wanted.max_mb)
         texels = lit_texels(parts, size)
     job.log.info("%d lamps, light maps of %d x %d, %d texels with surface", len(lamps.lamps), size, size, len(texels.index))

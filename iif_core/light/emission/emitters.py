@@ -25,8 +25,8 @@ from iif_core.light.emission.environment import Sky, sky_prior
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, BaseAlbedo, GainOptions, ObjectGains
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.hidden import with_hidden_surface
-from iif_core.light.emission.kinds import of_one_kind
-from iif_core.light.emission.odds import LampEvidence, LampOdds, ObjectLooks
+from iif_core.light.emission.kinds import Piece, of_one_kind, place_names
+from iif_core.light.emission.odds import OVERHEAD, LampEvidence, LampOdds, ObjectLooks, heights
 from iif_core.light.emission.photographs import SEEDS, Photographs, choose_rows, radiance_cache
 from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import (
@@ -229,6 +229,7 @@ def search_emitters(
         is_saturated=np.array([look.is_saturated(f) for f in family.tolist()], bool),
         is_hidden=every.is_hidden,
         needed=np.zeros(every.size),
+        brightness=np.ones(every.size),
     )
     # Without a largest value of the photographs nothing tells what is likely.
     unlikely = frozenset() if photos.sensor.is_hdr else frozenset(family[evidence.is_unlikely].tolist())
@@ -246,9 +247,12 @@ def search_emitters(
         before = after
     is_chosen, shines = np.isin(family, [*chosen]), np.zeros(all_groups, bool)
     shines[offered] = is_chosen[: groups.size]
-    needed = look.needed(chosen)
-    evidence = replace(evidence.select(is_chosen), needed=np.array([needed[f] for f in family[is_chosen].tolist()], np.float64))
-    return traced(photos, unseen, every.select(is_chosen), sky, threshold), shines, told, evidence
+    evidence = evidence.select(is_chosen)
+    found, own = traced(photos, unseen, every.select(is_chosen), sky, threshold), family[is_chosen]
+    kind = _kinds(photos, found.groups, own, evidence.is_saturated | evidence.is_hidden)
+    speaks = look.evidence(chosen, lambda f: frozenset(own[kind == kind[own == f][0]].tolist()))
+    needed, brightness = np.array([speaks[f] for f in own.tolist()], np.float64).reshape(-1, 2).T
+    return found, shines, told, replace(evidence, needed=needed, brightness=brightness)
 
 
 def solve_with_saturated_surface(
@@ -277,6 +281,23 @@ def in_doubt(photos: Photographs, found: Traced, solution: EmissionSolution) -> 
     n = found.groups.size
     family = _families(photos, found.groups, n)
     return insignificant(solution.radiance[:n], solution.error[:n], found.level_error[:n], found.groups.area, family)
+
+
+def lamp_names(photos: Photographs, groups: EmitterGroups, radiance: np.ndarray) -> list[str]:
+    """Call groups that radiate (G, 3) by where they are (`place_names`)."""
+    scene, owner = photos.scene, _objects(photos, groups)
+    up = np.asarray(photos.up, np.float64)
+    things = np.unique(owner[owner >= 0])
+    overhead = np.zeros(scene.n_objects + 1, bool)  # the last for surface of no object
+    overhead[things] = heights(photos.tracer, scene, things, up) >= OVERHEAD
+    pieces = [Piece.of(scene.vertices, scene.faces[groups.of_face == g]) for g in range(groups.size)]
+    power = groups.area * np.maximum(radiance, 0.0).sum(1)
+    return place_names(pieces, up / np.linalg.norm(up), overhead[owner], groups.is_hidden, power)
+
+
+def object_called(photos: Photographs, groups: EmitterGroups) -> list[str]:
+    """Return the name of the object to which most of the surface of each group belongs."""
+    return [photos.names[o] if o >= 0 else "surface of no object" for o in _objects(photos, groups)]
 
 
 def _differs(cache: RadianceVoxels, before: RadianceVoxels, share: float) -> bool:
@@ -390,10 +411,9 @@ def solve(photos: Photographs, found: Traced, sky: Sky | None) -> EmissionSoluti
     initial = prior.initial
     family = _families(photos, found.groups, len(initial))
     # Where nothing but its light tells how bright a lamp is, lamps of one kind are alike.
-    groups, scene = found.groups, photos.scene
-    family[: groups.size] = of_one_kind(
-        groups, scene.vertices, scene.faces, family[: groups.size], problem.is_bounded(groups.size) | groups.is_hidden
-    )
+    groups = found.groups
+    alike = problem.is_bounded(groups.size) | groups.is_hidden
+    family[: groups.size] = _kinds(photos, groups, family[: groups.size], alike)
     width = np.full(len(initial), FAMILY_WIDTH)
     if sky is not None and sky.is_unseen:
         outside = np.arange(found.groups.size, len(initial))
@@ -412,6 +432,11 @@ def _families(photos: Photographs, groups: EmitterGroups, n_groups: int) -> np.n
     family[: groups.size] = _objects(photos, groups)
     family[: groups.size][groups.is_hidden] += photos.scene.n_objects
     return family
+
+
+def _kinds(photos: Photographs, groups: EmitterGroups, family: np.ndarray, alike: np.ndarray) -> np.ndarray:
+    """(G,) int: families (G,) of lamps of one kind, of those that look `alike`."""
+    return of_one_kind(groups, photos.scene.vertices, photos.scene.faces, family, alike)
 
 
 def _objects(photos: Photographs, groups: EmitterGroups) -> np.ndarray:

@@ -11,6 +11,8 @@ from iif_core.light.emission.direct import EmissionSolution
 from iif_core.light.emission.emitters import (
     Traced,
     in_doubt,
+    lamp_names,
+    object_called,
     reliable,
     search_emitters,
     solve_with_saturated_surface,
@@ -62,7 +64,8 @@ class FoundLight:
         photos: with that assumption; look: the first look at them.
         found: the problem; solution: of it.
         evidence: what speaks for each of its groups; None = photographs without a largest value, of which no room told the odds.
-        left_out, reasons: candidate groups that turned out to reflect, and why.
+        names: of the groups, by where they are; left_out, reasons, left_on: candidate groups that turned out to reflect, why, and
+            the objects that most of them are on.
         gain: (n_objects, 3) of the albedos.
         outside: the sky, None = none; sun: what speaks for one in it.
         hidden: number of groups that no camera sees and that were thought to shine.
@@ -74,8 +77,10 @@ class FoundLight:
     found: Traced
     evidence: LampEvidence | None
     solution: EmissionSolution
+    names: list[str]
     left_out: EmitterGroups
     reasons: list[str]
+    left_on: list[str]
     gain: np.ndarray
     outside: Sky | None
     sun: SunEvidence | None
@@ -178,14 +183,17 @@ def find_light(photos: Photographs, look: FirstLook, environment: bool, is_open:
         found, evidence = traced(photos, unseen, found.groups.select(~weak), outside, threshold), evidence.select(~weak)
         found, solution = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
     gain = reliable(found.gains) if len(found.prior.initial) else gain  # without emitters those of the trial stay
+    left_out = groups.select(reasons != "")
     return FoundLight(
         photos=photos,
         look=look,
         found=found,
         evidence=None if photos.sensor.is_hdr else evidence,
         solution=solution,
-        left_out=groups.select(reasons != ""),
+        names=lamp_names(photos, found.groups, solution.radiance[: found.groups.size]),
+        left_out=left_out,
         reasons=[reason for reason in reasons if reason],
+        left_on=object_called(photos, left_out),
         gain=gain,
         outside=outside,
         sun=sun,

@@ -23,6 +23,12 @@ LARGEST = 1.0
 """Area (m^2) up to which lamps of the same size are of one kind: larger surface is wall or ceiling."""
 SAME_SIZE = 1.2
 """Largest ratio of the areas, and of the radii about their middle, of lamps of one kind."""
+UPRIGHT = 0.5
+"""Cosine between the axis of a flat piece and the vertical, below which it stands upright."""
+FLAT = 0.8
+"""Share of the area of a piece that faces along its axis, from which it is flat."""
+LARGE = 0.25
+"""Area (m^2) from which a flat upright lamp is called a window, if it is a single pane."""
 
 
 def of_one_kind(
@@ -55,6 +61,40 @@ def side_by_side(pieces: Sequence[Piece]) -> np.ndarray:
     return component_labels(len(pieces), *_pairs(pieces, lambda i, j, a, b: a.is_next_to(b)))
 
 
+def place_names(
+    pieces: Sequence[Piece], up: np.ndarray, overhead: np.ndarray, unseen: np.ndarray, power: np.ndarray
+) -> list[str]:
+    """Call lamps by where they are: `ceiling light`, `window` (flat, upright, and large or of several panes), `lamp`, or
+    `unseen lamp`; with a number, the strongest of each sort first. The panes of one window, side by side, have one name.
+
+    Args:
+        pieces: n lamps.
+        up: (3,) of length 1.
+        overhead, unseen: (n,) bool, the lamp hangs overhead; no camera sees it.
+        power: (n,) >= 0.
+    """
+    together = side_by_side(pieces)
+    # An unseen piece beside a pane is a lamp of its own: it may be wall.
+    together = np.unique(2 * together + unseen, return_inverse=True)[1].ravel()
+    sorts = []
+    for number in range(len(set(together.tolist()))):
+        own = np.flatnonzero(together == number)
+        stands = all(pieces[i].is_flat and abs(pieces[i].normal @ up) < UPRIGHT for i in own)
+        if unseen[own].any():
+            sorts.append("unseen lamp")
+        elif overhead[own].any():
+            sorts.append("ceiling light")
+        elif stands and (len(own) > 1 or pieces[own[0]].area >= LARGE):
+            sorts.append("window")
+        else:
+            sorts.append("lamp")
+    names, count = [""] * len(sorts), dict.fromkeys(sorts, 0)
+    for number in np.argsort(-np.bincount(together, power, len(sorts)), kind="stable"):
+        count[sorts[number]] += 1
+        names[number] = f"{sorts[number]} {count[sorts[number]]}"
+    return [names[number] for number in together]
+
+
 def _pairs(pieces: Sequence[Piece], belong: Callable[[int, int, Piece, Piece], bool]) -> np.ndarray:
     """Return the numbers (2, k) of pieces of one plane that `belong` together, by their numbers and themselves."""
     pairs = [
@@ -68,7 +108,8 @@ def _pairs(pieces: Sequence[Piece], belong: Callable[[int, int, Piece, Piece], b
 
 @dataclass(frozen=True)
 class Piece:
-    """Faces (m, 3) of a lamp, their middle, area (m^2), radius about the middle (m), and the axis of most of their normals."""
+    """Faces (m, 3) of a lamp, their middle, area (m^2), radius about the middle (m), the axis of most of their normals, and
+    whether nearly all of them face along it."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -76,6 +117,7 @@ class Piece:
     area: float
     radius: float
     normal: np.ndarray
+    is_flat: bool
 
     @classmethod
     def of(cls, vertices: np.ndarray, faces: np.ndarray) -> Piece:
@@ -85,7 +127,8 @@ class Piece:
         radius = float(np.linalg.norm(vertices[faces].reshape(-1, 3) - middle, axis=1).max())
         # The side that a normal faces is arbitrary; a lamp all around has none.
         axis = np.linalg.eigh((normal * area[:, None]).T @ normal)[1][:, -1]
-        return cls(vertices, faces, middle, float(area.sum()), radius, axis)
+        along = float(area[np.abs(normal @ axis) >= PARALLEL].sum())
+        return cls(vertices, faces, middle, float(area.sum()), radius, axis, along >= FLAT * float(area.sum()))
 
     def is_in_plane_of(self, other: Piece) -> bool:
         """Most of both faces the same way, or the opposite one, and lies equally far along it."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -164,17 +164,19 @@ class LampEvidence:
     Attributes:
         is_likely: (G,) bool, of an object that is likely (`LampOdds`); is_saturated: (G,) bool, most of what is seen of
             its family is; is_hidden: (G,) bool, no camera sees it.
-        needed: (G,) logarithm by which the misfit (Eq. L.40) grows without its family, in the first look at all candidates.
+        needed: (G,) logarithm by which the misfit (Eq. L.40) grows without all of its kind, in the first look at all candidates.
+        brightness: (G,) radiance found for its family, relative to a white surface in its place under the light of the others.
     """
 
     is_likely: np.ndarray
     is_saturated: np.ndarray
     is_hidden: np.ndarray
     needed: np.ndarray
+    brightness: np.ndarray
 
     def select(self, keep: np.ndarray) -> LampEvidence:
         """Return the same of some groups."""
-        return LampEvidence(*(values[keep] for values in (self.is_likely, self.is_saturated, self.is_hidden, self.needed)))
+        return LampEvidence(*(getattr(self, field.name)[keep] for field in fields(self)))
 
     @property
     def columns(self) -> np.ndarray:

@@ -52,6 +52,17 @@ class Proposal(NamedTuple):
     alone: bool = True
 
 
+class Look(NamedTuple):
+    """What some families explain: their misfit; the problem with all columns, scaled by the gains, in which their light is
+    cached (`lit`); what white surface would show in the place of the pixels of all groups (n, 3); and the light of all
+    groups (G, 3), of those that reflect as they are seen."""
+
+    misfit: float
+    lit: EmissionProblem
+    white: np.ndarray
+    light: np.ndarray
+
+
 @dataclass(frozen=True)
 class Candidates:
     """All groups in one problem, as a first look at which of them shine.
@@ -101,7 +112,8 @@ class Candidates:
         do, so what could take their place is always traced, however bright they are. So is the set without all that are
         `unlikely`, if several are: each of several false lamps makes the others look needed.
         """
-        misfit, lit, _ = self._look(chosen)
+        now = self._look(chosen)
+        misfit = now.misfit
         found: dict[Families, float] = {}
         largest: dict[Families, tuple[float, float]] = {}  # growth of the misfit, in this look and in a separate trace
         always: set[Families] = set()
@@ -109,36 +121,37 @@ class Candidates:
 
         def with_added(families: Families, value: float, lit: EmissionProblem, most: int, out: int | None = None) -> None:
             for f in self._best_added(families, lit, NOTICEABLE * misfit)[:most]:
-                added, _, white = self._look(families | {f})
-                if added * self.weights[f] <= (1.0 - PROMISING) * value and not (
-                    out is not None and self._must_shine(out, white)
+                added = self._look(families | {f})
+                if added.misfit * self.weights[f] <= (1.0 - PROMISING) * value and not (
+                    out is not None and self._must_shine(out, added.white)
                 ):
-                    found[families | {f}] = added
+                    found[families | {f}] = added.misfit
 
-        with_added(chosen, misfit, lit, _ADDED)
+        with_added(chosen, misfit, now.lit, _ADDED)
         for out in sorted(chosen):
             rest = chosen - {out}
-            found[rest], lit, white = self._look(rest)
+            left = self._look(rest)
+            found[rest] = left.misfit
             if found[rest] <= _MISSED * misfit:
-                with_added(rest, found[rest], lit, _SWAPPED, out)
+                with_added(rest, found[rest], left.lit, _SWAPPED, out)
             if out in suspects:
-                instead = {rest | {f} for f in self._best_added(rest, lit, NOTICEABLE * misfit)[:_SWAPPED]}
-                found |= {families: self._look(families)[0] for families in instead - set(found)}
+                instead = {rest | {f} for f in self._best_added(rest, left.lit, NOTICEABLE * misfit)[:_SWAPPED]}
+                found |= {families: self._look(families).misfit for families in instead - set(found)}
                 always |= instead
             # Fewer families are worth a trace of their own if they explain nearly as much. How bright saturated surface is that
             # only reflects is not known before that trace.
             look = _MISSED if self.is_saturated(out) else 1.0 + PROMISING
             # Of a likely lamp, saturated, the excess is a lower bound and speaks for nothing.
-            reflects = bool(rest) and self.weights[out] >= 1.0 and self._excess(out, white) < 1.0
+            reflects = bool(rest) and self.weights[out] >= 1.0 and self._excess(out, left.white) < 1.0
             largest[rest] = look, _MISSED if reflects else 1.0 if out in doubtful else 1.0 - STEP
-            if (rest or (self.family < 0).any()) and self._must_shine(out, white):
+            if (rest or (self.family < 0).any()) and self._must_shine(out, left.white):
                 impossible.add(rest)
         likely = chosen - unlikely
         if len(chosen - likely) > 1 and (likely or (self.family < 0).any()):
-            white = self._look(likely)[2]
+            white = self._look(likely).white
             likely |= {f for f in chosen - likely if self._must_shine(f, white)}
             if len(chosen - likely) > 1:
-                found[likely], largest[likely] = self._look(likely)[0], (np.inf, 1.0)
+                found[likely], largest[likely] = self._look(likely).misfit, (np.inf, 1.0)
                 always.add(likely)
         order = sorted(
             found.keys() - impossible, key=lambda f: (found[f] * self.weight(f) * (1.0 + PROMISING) ** len(f), sorted(f))
@@ -148,16 +161,34 @@ class Candidates:
         worth = (f for f in order if f in always or self.weight(f) * found[f] <= growth[f][0] * present)
         return [Proposal(f, growth[f][1], f in always, f & chosen not in impossible) for f in worth]
 
-    def needed(self, chosen: Families) -> dict[int, float]:
-        """Return by how much the logarithm of the misfit grows without each of the `chosen` families; large if what is left
-        cannot be, 0 if neither can."""
-        sets = [chosen, *(chosen - {f} for f in sorted(chosen))]
-        present, *without = (np.log(np.clip(self._look(families)[0], *_MISFITS)) for families in sets)
-        return {f: float(value - present) for f, value in zip(sorted(chosen), without, strict=True)}
+    def evidence(self, chosen: Families, kind: Callable[[int], Families]) -> dict[int, tuple[float, float]]:
+        """Return what speaks for each of the `chosen` families, by family.
 
-    def _look(self, chosen: Families) -> tuple[float, EmissionProblem, np.ndarray]:
-        """Misfit of the families; the problem with all columns, scaled by the gains, in which their light is cached; and (n, 3)
-        what white surface would show in the place of the pixels of all groups."""
+        Returns:
+            The logarithm by which the misfit grows when all of its `kind` are dark, as one pane of a window hardly is without the
+            others: large if what is left cannot be, 0 if neither can. And the radiance that is found for it, relative to a white
+            surface in its place under the light that is left.
+        """
+        present = self._look(chosen)
+        without = {kinds: self._look(chosen - kinds) for kinds in {kind(f) for f in chosen}}
+        first = np.log(np.clip(present.misfit, *_MISFITS))
+        growth = {kinds: float(np.log(np.clip(look.misfit, *_MISFITS)) - first) for kinds, look in without.items()}
+        unseen = replace(self.white, seen=present.light)
+        found = {}
+        for f in sorted(chosen):
+            own, left = self.family == f, without[kind(f)]
+            rows = np.isin(self.of_group, np.flatnonzero(own))
+            if rows.any():
+                white, weight = left.white[rows].sum(1), self.reflecting.pixels[rows]
+                radiance = present.light[self.of_group[rows]].sum(1)
+                times = float(weight @ radiance / max(float(weight @ white), 1e-300))
+            else:
+                times = float(unseen.excess(left.light)[own].max())
+            found[f] = growth[kind(f)], times
+        return found
+
+    def _look(self, chosen: Families) -> Look:
+        """What the families explain when they shine and the others reflect."""
         keep = np.isin(self.family, [*chosen, -1])
         # Pixels on groups that do not shine are rows like any others: light that falls on them must explain how bright they are.
         every = self.problem.beside(self.reflecting.take(~keep[self.of_group]))
@@ -170,7 +201,7 @@ class Candidates:
         doubted = self.hidden & keep & (np.append(self.weights, 1.0)[self.family] >= 1.0)
         reflects = (replace(self.white, seen=light).excess(light) < HIDDEN_EXCESS) & doubted
         misfit = np.inf if reflects.any() else solved.misfit(radiance)
-        return misfit, lit_problem(every.with_gains(gains), light), self._white(light)
+        return Look(misfit, lit_problem(every.with_gains(gains), light), self._white(light), light)
 
     def _white(self, light: np.ndarray) -> np.ndarray:
         """(n, 3) what white surface would show in the place of the pixels of all groups that radiate `light` (G, 3)."""
