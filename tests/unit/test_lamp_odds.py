@@ -163,7 +163,7 @@ def test_probability_of_a_lamp_by_hand():
     )
     odds = np.log(own.probability / (1.0 - own.probability))
     slope = 4.3 * np.log(1.1)
-    np.testing.assert_allclose(odds, [1.3 + slope, -0.85, -1.3 + slope, -3.5, 1.3 + 4.3 * 0.3, -1.3 - 4.3 * 0.05])
+    np.testing.assert_allclose(odds, [1.3 + slope, -0.85, -1.3 + slope, -3.5, 1.3 + 4.3, -1.3 - 4.3 * 0.05])
     np.testing.assert_array_equal(own.select(needed > 0).probability, own.probability[needed > 0])
     # An unseen object is not saturated, whatever its family is.
     assert replace(own, is_saturated=np.ones(6, bool)).probability[2] == own.probability[2]

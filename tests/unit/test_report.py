@@ -411,7 +411,7 @@ def test_deliverable_is_complete_and_verifies(toy):
     emitters = read_parquet(scene / "emitters.parquet")
     np.testing.assert_allclose(emitters["radiance_r"][0], LAMP[0])
     assert list(emitters["object"]) == ["lamp", ""]  # the second was not kept
-    assert re.search(r'<th scope="row"[^>]*>lamp <small>0</small>', (scene / "report.html").read_text())
+    assert re.search(r'<th scope="row"[^>]*>ceiling light 1 <small>lamp, 0</small>', (scene / "report.html").read_text())
 
 
 def test_damage_is_named(toy, tmp_path):

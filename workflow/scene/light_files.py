@@ -40,11 +40,11 @@ def emitter_columns(
     (n,), `radiance` and `error` (n, 3); `kind`: None = all are faces; `evidence`: of the first of them, None = of none; `name`:
     None = numbers."""
     n = len(faces)
-    told = {"probability": np.full(n, UNKNOWN), "needed": np.zeros(n), "brightness": np.zeros(n)}
+    told = {"probability": np.full(n, UNKNOWN), "needed": np.zeros(n)}
     told |= {name: np.zeros(n, bool) for name in ("is_likely", "is_saturated", "is_hidden")}
     if evidence is not None:
-        for name, values in told.items():
-            values[: len(evidence.needed)] = getattr(evidence, name)
+        for column, values in told.items():
+            values[: len(evidence.needed)] = getattr(evidence, column)
     return {
         "emitter_id": np.arange(n, dtype=np.int32),
         "name": np.array([f"lamp {i}" for i in range(n)] if name is None else name, dtype=str),

@@ -229,7 +229,6 @@ def search_emitters(
         is_saturated=np.array([look.is_saturated(f) for f in family.tolist()], bool),
         is_hidden=every.is_hidden,
         needed=np.zeros(every.size),
-        brightness=np.ones(every.size),
     )
     # Without a largest value of the photographs nothing tells what is likely.
     unlikely = frozenset() if photos.sensor.is_hdr else frozenset(family[evidence.is_unlikely].tolist())
@@ -250,9 +249,8 @@ def search_emitters(
     evidence = evidence.select(is_chosen)
     found, own = traced(photos, unseen, every.select(is_chosen), sky, threshold), family[is_chosen]
     kind = _kinds(photos, found.groups, own, evidence.is_saturated | evidence.is_hidden)
-    speaks = look.evidence(chosen, lambda f: frozenset(own[kind == kind[own == f][0]].tolist()))
-    needed, brightness = np.array([speaks[f] for f in own.tolist()], np.float64).reshape(-1, 2).T
-    return found, shines, told, replace(evidence, needed=needed, brightness=brightness)
+    needed = look.needed(chosen, lambda f: frozenset(own[kind == kind[own == f][0]].tolist()))
+    return found, shines, told, replace(evidence, needed=np.array([needed[f] for f in own.tolist()], np.float64))
 
 
 def solve_with_saturated_surface(

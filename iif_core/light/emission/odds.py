@@ -25,7 +25,7 @@ WORTH = 15.0
 PROBABILITY = (-3.5, 2.15, 2.65, 2.2, 4.3)
 """Logarithm of the odds that what was found to shine is a lamp: constant, and what counts that it is likely, saturated,
 seen by no camera, and needed."""
-_NEEDED = (-0.05, 0.3)
+_NEEDED = (-0.05, 1.0)
 """Limits of the logarithm of the growth of the misfit without it."""
 _STEP_OFF = 0.01
 """Metres below the highest and the lowest point of an object at which its vertical rays start. Many lamps are flush with a
@@ -165,14 +165,12 @@ class LampEvidence:
         is_likely: (G,) bool, of an object that is likely (`LampOdds`); is_saturated: (G,) bool, most of what is seen of
             its family is; is_hidden: (G,) bool, no camera sees it.
         needed: (G,) logarithm by which the misfit (Eq. L.40) grows without all of its kind, in the first look at all candidates.
-        brightness: (G,) radiance found for its family, relative to a white surface in its place under the light of the others.
     """
 
     is_likely: np.ndarray
     is_saturated: np.ndarray
     is_hidden: np.ndarray
     needed: np.ndarray
-    brightness: np.ndarray
 
     def select(self, keep: np.ndarray) -> LampEvidence:
         """Return the same of some groups."""

@@ -54,13 +54,11 @@ class Proposal(NamedTuple):
 
 class Look(NamedTuple):
     """What some families explain: their misfit; the problem with all columns, scaled by the gains, in which their light is
-    cached (`lit`); what white surface would show in the place of the pixels of all groups (n, 3); and the light of all
-    groups (G, 3), of those that reflect as they are seen."""
+    cached (`lit`); and what white surface would show in the place of the pixels of all groups (n, 3)."""
 
     misfit: float
     lit: EmissionProblem
     white: np.ndarray
-    light: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -161,31 +159,13 @@ class Candidates:
         worth = (f for f in order if f in always or self.weight(f) * found[f] <= growth[f][0] * present)
         return [Proposal(f, growth[f][1], f in always, f & chosen not in impossible) for f in worth]
 
-    def evidence(self, chosen: Families, kind: Callable[[int], Families]) -> dict[int, tuple[float, float]]:
-        """Return what speaks for each of the `chosen` families, by family.
-
-        Returns:
-            The logarithm by which the misfit grows when all of its `kind` are dark, as one pane of a window hardly is without the
-            others: large if what is left cannot be, 0 if neither can. And the radiance that is found for it, relative to a white
-            surface in its place under the light that is left.
-        """
-        present = self._look(chosen)
-        without = {kinds: self._look(chosen - kinds) for kinds in {kind(f) for f in chosen}}
-        first = np.log(np.clip(present.misfit, *_MISFITS))
-        growth = {kinds: float(np.log(np.clip(look.misfit, *_MISFITS)) - first) for kinds, look in without.items()}
-        unseen = replace(self.white, seen=present.light)
-        found = {}
-        for f in sorted(chosen):
-            own, left = self.family == f, without[kind(f)]
-            rows = np.isin(self.of_group, np.flatnonzero(own))
-            if rows.any():
-                white, weight = left.white[rows].sum(1), self.reflecting.pixels[rows]
-                radiance = present.light[self.of_group[rows]].sum(1)
-                times = float(weight @ radiance / max(float(weight @ white), 1e-300))
-            else:
-                times = float(unseen.excess(left.light)[own].max())
-            found[f] = growth[kind(f)], times
-        return found
+    def needed(self, chosen: Families, kind: Callable[[int], Families]) -> dict[int, float]:
+        """Return by how much the logarithm of the misfit grows without all of the `kind` of each of the `chosen` families, as
+        one pane of a window is hardly needed where the others are; large if what is left cannot be, 0 if neither can."""
+        present = np.log(np.clip(self._look(chosen).misfit, *_MISFITS))
+        kinds = {kind(f) for f in chosen}
+        growth = {own: float(np.log(np.clip(self._look(chosen - own).misfit, *_MISFITS)) - present) for own in kinds}
+        return {f: growth[kind(f)] for f in sorted(chosen)}
 
     def _look(self, chosen: Families) -> Look:
         """What the families explain when they shine and the others reflect."""
@@ -201,7 +181,7 @@ class Candidates:
         doubted = self.hidden & keep & (np.append(self.weights, 1.0)[self.family] >= 1.0)
         reflects = (replace(self.white, seen=light).excess(light) < HIDDEN_EXCESS) & doubted
         misfit = np.inf if reflects.any() else solved.misfit(radiance)
-        return Look(misfit, lit_problem(every.with_gains(gains), light), self._white(light), light)
+        return Look(misfit, lit_problem(every.with_gains(gains), light), self._white(light))
 
     def _white(self, light: np.ndarray) -> np.ndarray:
         """(n, 3) what white surface would show in the place of the pixels of all groups that radiate `light` (G, 3)."""
