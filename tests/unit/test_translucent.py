@@ -134,6 +134,7 @@ def test_too_few_pixels_of_one_kind():
     assert not is_brighter_where_open(*pixels_of(5.0, 0.1, opens=7), 3).any()
     assert not is_brighter_where_open(*pixels_of(5.0, 0.1, rest=7), 3).any()
     assert not is_brighter_where_open(*pixels_of(5.0, 0.1, opens=40, rest=960), 3).any()  # one pixel in 25: an edge
+    assert not is_brighter_where_open(*pixels_of(5.0, 0.1, opens=960, rest=40), 3).any()  # a pane, and the wall beside it
     assert not is_brighter_where_open(np.zeros(0, int), np.zeros(0, bool), np.zeros(0), 3).any()
 
 

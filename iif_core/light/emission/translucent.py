@@ -8,7 +8,8 @@ TRANSMITTANCE = 0.5
 """Share of the light that passes straight through curtains and blinds. What a room shows is this times the light behind them,
 so another value changes that light first of all (docs/method/light.md#surface-that-lets-light-through)."""
 OPEN_SHARE = 0.05
-"""Share of the pixels of an object with nothing behind them, at least."""
+"""Share of the pixels of an object with nothing behind them, and with something, at least: fewer are those of its edge, as a
+pane has them beside the wall."""
 OPEN_RATIO = 1.5
 """Mean radiance of these pixels relative to the others of the object, at least."""
 
@@ -33,5 +34,5 @@ def is_brighter_where_open(
         np.bincount(object_id[kind], radiance[kind], n_objects) / np.maximum(count, 1)
         for kind, count in zip((is_open, ~is_open), kinds, strict=True)
     ]
-    enough = (kinds[0] >= np.maximum(min_pixels, OPEN_SHARE * (kinds[0] + kinds[1]))) & (kinds[1] >= min_pixels)
+    enough = np.minimum(*kinds) >= np.maximum(min_pixels, OPEN_SHARE * (kinds[0] + kinds[1]))
     return enough & (means[0] >= OPEN_RATIO * means[1])
