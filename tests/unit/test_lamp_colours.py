@@ -117,6 +117,13 @@ def test_panes_side_by_side_are_of_one_kind():
     assert kinds(big, ([0.0, 0.7 + gap, 1], 0.4, 1)) == [0, 1]  # square to it
 
 
+def test_a_lamp_shines_to_both_sides_unless_all_of_it_shines_to_one():
+    of_face, side = np.array([0, 0, 1, 1, -1, 2, 3, 3]), np.array([1, 1, 0, 0, 0, -1, 1, -1])
+    groups = EmitterGroups(of_face, side, np.array([2, 2, 1, 2]), np.ones(4), np.ones((4, 3)), np.ones(4, int), [])
+    assert groups.sides.tolist() == [1, 0, -1, 0]
+    assert EmitterGroups.none(3).sides.tolist() == []
+
+
 def called(*placed, overhead=(), unseen=(), power=None):
     pieces = [Piece.of(*squares(one)) for one in placed]
     number = np.arange(len(placed))

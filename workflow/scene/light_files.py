@@ -10,7 +10,6 @@ from iif_core.camera.calibration.choice import CalibratedResponse, calibration_f
 from iif_core.camera.response import response_facts
 from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.find import FoundLight
-from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.odds import LampEvidence
 from workflow.decisions import light as decisions
 from workflow.decisions import numerics
@@ -115,7 +114,6 @@ def _table(light: FoundLight) -> dict[str, Any]:
     """Columns of emitters.parquet: emitters, the environment, and the groups that turned out to reflect."""
     groups, left_out, solution, sky = light.found.groups, light.left_out, light.solution, light.outside
     outside, out = sky.size if sky else 0, left_out.size
-    sides = [[_side_of(g, i) for i in range(g.size)] for g in (groups, left_out)]
     pixels = sky.pixels if sky else np.zeros(0)
     return emitter_columns(
         faces=np.r_[groups.faces, np.zeros(outside), left_out.faces],
@@ -126,15 +124,10 @@ def _table(light: FoundLight) -> dict[str, Any]:
         kept=np.arange(groups.size + outside + out) < groups.size + outside,
         reason=[""] * (groups.size + outside) + light.reasons,
         kind=["area"] * groups.size + ["environment"] * outside + ["area"] * out,
-        side=np.array([*sides[0], *[0] * outside, *sides[1]]),
+        side=np.r_[groups.sides, np.zeros(outside, np.int32), left_out.sides],
         evidence=light.evidence,
         name=[*light.names, *["light from outside"] * outside, *light.left_on],
     )
-
-
-def _side_of(groups: EmitterGroups, group: int) -> int:
-    sides = groups.side[groups.of_face == group]
-    return int(sides[0]) if len(sides) and (sides == sides[0]).all() else 0
 
 
 def _write_facts(

@@ -289,7 +289,7 @@ def lamp_names(photos: Photographs, groups: EmitterGroups, radiance: np.ndarray)
     overhead = np.zeros(scene.n_objects + 1, bool)  # the last for surface of no object
     overhead[things] = heights(photos.tracer, scene, things, up) >= OVERHEAD
     pieces = [Piece.of(scene.vertices, scene.faces[groups.of_face == g]) for g in range(groups.size)]
-    power = groups.area * np.maximum(radiance, 0.0).sum(1)
+    power = np.where(groups.sides == 0, 2.0, 1.0) * groups.area * np.maximum(radiance, 0.0).sum(1)
     return place_names(pieces, up / np.linalg.norm(up), overhead[owner], groups.is_hidden, power)
 
 

@@ -46,6 +46,12 @@ class EmitterGroups:
         """(G,) bool: no camera sees the group, or hardly (`odds.ObjectLooks.known`)."""
         return self.count == 0
 
+    @property
+    def sides(self) -> np.ndarray:
+        """(G,) int32 side that shines, as in `side`; 0 = both, or some faces the one and some the other."""
+        sides = (np.unique(self.side[self.of_face == g]) for g in range(self.size))
+        return np.array([own[0] if len(own) == 1 else 0 for own in sides], np.int32)
+
     def select(self, kept: np.ndarray) -> EmitterGroups:
         """The groups of a mask (G,), renumbered."""
         number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1).astype(np.int32)  # the last is for -1, no group
