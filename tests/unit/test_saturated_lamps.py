@@ -46,6 +46,22 @@ def test_a_shorter_exposure_tells_the_radiance_of_a_lamp():
     np.testing.assert_array_equal(got.bound[:18], bound[:18])
 
 
+def test_what_stands_before_a_lamp_is_not_the_lamp():
+    """A shade that a mesh lacks is as bright as the lamp's bounds in one channel, and dark in the others. A warm lamp whose red
+    is saturated and whose green is not shows its green; blue is no bound in most views and stays out of it."""
+    shade, warm = slice(20, 24), slice(24, 28)
+    bound = np.ones((28, 3), bool)
+    bound[:, 2] = False
+    bound[shade] = False
+    bound[warm, 1] = False
+    lamp = pixels(np.zeros(28, int), np.repeat(np.arange(7), 4), bound)
+    lamp.radiance[shade] = [1.1 * BRIGHT, DIM, DIM]
+    lamp.radiance[warm, 1] = 1.2 * BRIGHT
+    got = lamp.with_majority().bound
+    assert got[shade, :2].all() and not got[:, 2].any()
+    np.testing.assert_array_equal(got[warm], bound[warm])
+
+
 def test_a_few_bounds_that_are_too_high_hide_no_shorter_exposure():
     bound = np.ones((40, 3), bool)
     bound[36:] = False

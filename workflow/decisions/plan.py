@@ -9,7 +9,7 @@ from iif_core.requirements.evidence import Evidence
 from workflow.decisions.record import FORCED, PROVISIONAL, SETTLED, Decision, by_evidence, decision, not_probed
 
 ESCAPE_PRIMARY = 1e-3
-"""Share of camera rays that leave the mesh, above which an environment is considered, where no evidence tells."""
+"""Share of camera rays that leave the mesh, up to which it is closed: nothing tells the light of cracks from that of lamps."""
 ESCAPE_SECONDARY = 2e-3
 """The same for rays from the surface."""
 ESCAPE_BRIGHTNESS = 0.02
@@ -68,11 +68,12 @@ def environment(
         brightness <= ESCAPE_BRIGHTNESS or (brightness <= 1.0 and escape_secondary * brightness < ESCAPE_LIGHT)
     )
     # Seen, not inferred: a small lamp that the probe's rays miss may look like light from outside.
+    is_closed = not (escape_primary > ESCAPE_PRIMARY or escape_secondary > ESCAPE_SECONDARY)
     into = f"{leaves}, into {brightness:.1%} of the mean brightness" if dark else ""
     if evidence is None:
         if setting != "auto":
             included, reason, status = setting == "on", f"forced {setting}", FORCED
-        elif not (escape_primary > ESCAPE_PRIMARY or escape_secondary > ESCAPE_SECONDARY):
+        elif is_closed:
             included, reason, status = False, f"the mesh is closed: {leaves}", SETTLED
         else:
             included, reason, status = not dark, into or leaves, SETTLED
@@ -80,6 +81,8 @@ def environment(
         return decision("environment", included, measure, escape_secondary, ESCAPE_SECONDARY, reason, status)
     if setting == "auto" and not (escape_primary or escape_secondary):
         return not_probed("environment", False, f"the mesh is closed: {leaves}", SETTLED)
+    if setting == "auto" and is_closed:
+        return by_evidence("environment", False, evidence, f"the mesh is closed: {leaves}", SETTLED)
     if setting == "auto" and dark:
         return by_evidence("environment", False, evidence, into, SETTLED)
     words = (f"{leaves}, and bring light", f"{leaves}, and bring no light", f"{leaves}; the photographs do not tell yet")

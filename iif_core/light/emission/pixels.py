@@ -59,20 +59,21 @@ class EmissionPixels(Rows):
 
         Compression, blur, noise and wrong poses lower some of the pixels of a saturated lamp to below saturation. They would be
         taken for its radiance, against everything that the other pixels say; what they show is still less than it. A shorter
-        exposure shows the radiance itself, which no bound exceeds: views that have no bound in the channel, and a median of at
-        least the `HIGH_BOUND` quantile of the bounds, stay as they are.
+        exposure shows the radiance itself, which no bound exceeds: views that have no bound in the channel, and in every channel
+        some bound or a median of at least the `HIGH_BOUND` quantile of the bounds, stay as they are. A view that is dark in one
+        of these channels shows something before the lamp that the mesh lacks.
         """
         bound = self.bound.copy()
         for group in np.unique(self.group[self.group >= 0]):
             own = np.flatnonzero(self.group == group)
-            for c in range(3):
-                known, shown = self.bound[own, c], self.radiance[own, c]
-                if 2 * known.sum() <= len(own):
-                    continue
-                least = np.quantile(shown[known], HIGH_BOUND)
-                for view in np.unique(self.view[own]):
-                    here = self.view[own] == view
-                    bound[own[here], c] |= known[here].any() or np.median(shown[here]) < least
+            known, shown = self.bound[own], self.radiance[own]
+            mostly = np.flatnonzero(2 * known.sum(0) > len(own))
+            least = np.array([np.quantile(shown[known[:, c], c], HIGH_BOUND) for c in mostly])
+            for view in np.unique(self.view[own]):
+                here = self.view[own] == view
+                has_bound = known[here][:, mostly].any(0)
+                shows_lamp = (has_bound | (np.median(shown[here][:, mostly], 0) >= least)).all()
+                bound[np.ix_(own[here], mostly)] |= has_bound | ~shows_lamp
         return replace(self, bound=bound)
 
     @property
