@@ -35,7 +35,8 @@ def _number(photos, name):
 
 
 def _heights(photos, up=UP):
-    found = heights(photos.tracer, photos.scene, np.arange(photos.scene.n_objects), up)
+    found, room = heights(photos.tracer, photos.scene, np.arange(photos.scene.n_objects), up)
+    assert (room > 0).all() and (room <= np.ptp(photos.scene.vertices @ (up / np.linalg.norm(up))) + 0.1).all()
     return dict(zip(photos.names, found, strict=True))
 
 

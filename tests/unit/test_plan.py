@@ -92,7 +92,8 @@ LEANS = Evidence(-15.0, 10.0, 500)
     ("decision", "included", "status"),
     [
         (plan.environment("auto", 0.0, 0.0, 1.0, IN), False, SETTLED),
-        (plan.environment("auto", 0.0002, 0.0006, 3.0, IN), False, SETTLED),  # cracks of a closed mesh
+        (plan.environment("auto", 0.0002, 0.0006, 3.0, Evidence(19.0, 10.0, 500)), False, SETTLED),  # cracks of a closed mesh
+        (plan.environment("auto", 0.0002, 0.0006, 3.0, IN), True, SETTLED),
         (plan.environment("auto", 0.0002, 0.0021, 3.0, IN), True, SETTLED),
         (plan.environment("on", 0.0002, 0.0006, 3.0, IN), True, FORCED),
         (plan.environment("auto", 0.1, 0.1, 1.0, IN), True, SETTLED),

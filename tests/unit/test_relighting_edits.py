@@ -531,8 +531,14 @@ def test_the_panes_of_a_window_are_called_together():
     lamps = [Lamp(0, (1,), 1.0, "window 1"), Lamp(1, (2,), 1.0, "window 1"), Lamp(4, (3,), 1.0, "lamp 1")]
     room = Inventory(["wall", "pane", "pane", "window 1"], lamps)
     assert room.lamps_called("window 1", "x") == [0, 1] and room.lamps_called("lamp 1", "x") == [2]
-    with refused("relight.lamps", "'window 2'", "'window 1'", "window 1 (pane), window 1 (pane), lamp 1 (window 1)"):
+    with refused("relight.lamps", "'window 2'", "'window 1'", "window 1, lamp 1;"):
         room.lamps_called("window 2", "relight.lamps")
+    with refused("relight.lamps", "'light from outside'", "environment: off"):
+        room.lamps_called("light from outside", "relight.lamps")
+    found = room.expanded([entry(each="alone")])
+    assert [(one["name"], list(one["lamps"])) for one in found] == [("a_window_1", ["window 1"]), ("a_lamp_1", ["lamp 1"])]
+    for one in found:
+        room.check(one)
 
 
 def test_lamps_are_called_by_object_or_id(things):

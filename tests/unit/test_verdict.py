@@ -75,13 +75,15 @@ def test_a_mesh_that_only_its_own_photographs_judge_is_never_good():
 
 
 def test_lamps_that_are_more_likely_surface_light_no_room():
-    assert changed(unlikely=2, unlikely_power=0.1)["light"] == GREEN  # one is left, and has most of the light
-    assert changed(unlikely=2, unlikely_power=0.9)["light"] == AMBER
-    said = judge(dataclasses.replace(GOOD, unlikely=2, unlikely_power=0.1)).lights[1].shown
-    assert any("2 of them" in finding.text and "10 %" in finding.text for finding in said)
-    assert changed(unlikely=3)["light"] == RED
-    assert changed(unlikely=3, environment=True)["light"] == AMBER
-    assert changed(unlikely=3, environment=True, escape=0.5)["light"] == RED
+    assert changed(unlikely=("a", "b"), unlikely_power=0.1)["light"] == GREEN  # one is left, and has most of the light
+    assert changed(unlikely=("a", "b"), unlikely_power=0.9)["light"] == AMBER
+    said = judge(dataclasses.replace(GOOD, unlikely=("a", "b"), unlikely_power=0.1)).lights[1].shown
+    assert any("bright surface: a, b, with 10 %" in finding.text for finding in said)
+    many = judge(dataclasses.replace(GOOD, lamps=9, unlikely=tuple("abcdef"), unlikely_power=0.1)).lights[1].shown
+    assert any("a, b, c and 3 more" in finding.text for finding in many)
+    assert changed(unlikely=("a", "b", "c"))["light"] == RED
+    assert changed(unlikely=("a", "b", "c"), environment=True)["light"] == AMBER
+    assert changed(unlikely=("a", "b", "c"), environment=True, escape=0.5)["light"] == RED
 
 
 def test_the_worst_photograph_is_named():

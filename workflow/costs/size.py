@@ -9,10 +9,8 @@ from typing import Any
 
 from workflow import plugins
 from workflow.costs.work import SceneSize
-from workflow.intake.pictures import PHOTOGRAPHS, RAW
+from workflow.intake.pictures import EXTRAS, PHOTOGRAPHS, RAW
 
-EXTRAS = {"truth", "masks", "instances", "depth", "predictions"}
-"""Folders of a scene whose pictures are not photographs (docs/guide/own-data.md#4-the-folder)."""
 MESHES = (".ply", ".obj", ".glb", ".serialized")
 BYTES_PER_FACE = 36
 """Of a mesh whose header does not say how many faces it has: a guess between binary and text, which is good enough because costs

@@ -9,9 +9,12 @@ from iif_core.requirements.evidence import Evidence
 from workflow.decisions.record import FORCED, PROVISIONAL, SETTLED, Decision, by_evidence, decision, not_probed
 
 ESCAPE_PRIMARY = 1e-3
-"""Share of camera rays that leave the mesh, up to which it is closed: nothing tells the light of cracks from that of lamps."""
+"""Share of camera rays that leave the mesh, up to which it is closed."""
 ESCAPE_SECONDARY = 2e-3
 """The same for rays from the surface."""
+CRACKS = 2.0
+"""Standard errors by which photographs must gain from light that comes through a closed mesh: its cracks fit any colour that lamps
+lack."""
 ESCAPE_BRIGHTNESS = 0.02
 """Brightness of escaping camera rays, relative to the photographs, up to which the outside counts as black."""
 ESCAPE_LIGHT = 0.01
@@ -81,7 +84,7 @@ def environment(
         return decision("environment", included, measure, escape_secondary, ESCAPE_SECONDARY, reason, status)
     if setting == "auto" and not (escape_primary or escape_secondary):
         return not_probed("environment", False, f"the mesh is closed: {leaves}", SETTLED)
-    if setting == "auto" and is_closed:
+    if setting == "auto" and is_closed and evidence.gain < CRACKS * evidence.error:
         return by_evidence("environment", False, evidence, f"the mesh is closed: {leaves}", SETTLED)
     if setting == "auto" and dark:
         return by_evidence("environment", False, evidence, into, SETTLED)

@@ -16,6 +16,8 @@ from workflow.intake.documents import check_file, reading
 FORMATS = ("PNG", "JPEG", "HEIF", "AVIF", "TIFF", "WEBP", "BMP")
 """Formats of Pillow that photographs may have, whatever their name; Pillow's other readers, such as its PostScript reader, are
 not used. MPO, which telephones write as .jpg, is opened as JPEG; HEIF is read by pi-heif."""
+EXTRAS = {"truth", "masks", "instances", "depth", "predictions"}
+"""Folders of a scene whose pictures are not photographs (docs/guide/own-data.md#4-the-folder)."""
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".exr", ".heic", ".heif", ".avif", ".tif", ".tiff", ".webp", ".bmp")
 """Extensions of photographs, and of maps that belong to them."""
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")

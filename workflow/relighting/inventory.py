@@ -18,6 +18,8 @@ from workflow.settings.names import did_you_mean
 
 Array = np.ndarray
 
+OUTSIDE = "light from outside"
+"""What reports and room pages call the light that the environment sends in."""
 MOST_EACH = 12
 """Lamps of which a relighting with `each` makes pictures."""
 
@@ -70,6 +72,10 @@ class Inventory:
         more = f" and {len(lamp.objects) - 1} more" if len(lamp.objects) > 1 else ""
         return f"{(self.shown or self.names)[lamp.objects[0]]}{more}"
 
+    def key_of(self, lamp: Lamp) -> str:
+        """Return the key of the settings that means a lamp as people see it: its name, or its id where it has none."""
+        return lamp.name or f"emitter {lamp.emitter_id}"
+
     def is_called(self, number: int, key: str) -> bool:
         """Return whether a key of the settings is the name of an object, as people see it or as the segmentation gave it."""
         return key == self.names[number] or key in self.shown[number : number + 1]
@@ -90,16 +96,22 @@ class Inventory:
         found = by_name or [i for i, lamp in enumerate(self.lamps) if key == str(lamp.emitter_id)]
         if found:
             return found
-        there = ", ".join(f"{lamp.name or lamp.emitter_id} ({self.name_of(lamp)})" for lamp in self.lamps[:8]) or "none"
+        each = dict.fromkeys(lamp.name or f"{lamp.emitter_id} ({self.name_of(lamp)})" for lamp in self.lamps)
+        there = f"{', '.join(list(each)[:8])}; the report lists them" if each else "none"
+        if key == OUTSIDE:
+            raise InputError(f"{where}: {key!r} is no lamp; `environment` switches and dims it: `environment: off`")
         known = [(self.shown or self.names)[o] for lamp in self.lamps for o in lamp.objects]
         hint = did_you_mean(key, [*known, *(lamp.name for lamp in self.lamps if lamp.name)], "{!r}")
         is_there = any(self.is_called(o, key) for o in range(len(self.names)))
         what = f"object {key!r} does not shine" if is_there else f"there is no lamp {key!r}"
-        raise InputError(f"{where}: {what}.{hint} Lamps of this room: {there}; the report lists them")
+        raise InputError(f"{where}: {what}.{hint} Lamps of this room: {there}")
 
     def expanded(self, entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
         """Return dumped relightings, those with `each` as one for each of the strongest lamps, the strongest first."""
-        strongest = sorted(self.lamps, key=lambda lamp: -lamp.power)[:MOST_EACH]
+        power: dict[str, float] = {}
+        for lamp in self.lamps:
+            power[self.key_of(lamp)] = power.get(self.key_of(lamp), 0.0) + lamp.power
+        strongest = sorted(power, key=lambda key: -power[key])[:MOST_EACH]
         out = []
         for entry in entries:
             if not entry["each"]:
@@ -107,9 +119,9 @@ class Inventory:
                 continue
             rest, own = (0.0, 1.0) if entry["each"] == "alone" else (1.0, 0.0)
             outside = "off" if entry["each"] == "alone" and entry["environment"] == "keep" else entry["environment"]
-            for lamp in strongest:
-                lamps = {f"emitter {lamp.emitter_id}": {"factor": own, "colour": None, "move": None}}
-                name = f"{entry['name']}_{lamp.emitter_id}"
+            for key in strongest:
+                lamps = {key: {"factor": own, "colour": None, "move": None}}
+                name = f"{entry['name']}_{key.removeprefix('emitter ').replace(' ', '_')}"
                 out.append(entry | {"name": name, "each": None, "emitters": rest, "lamps": lamps, "environment": outside})
         return out
 

@@ -31,5 +31,5 @@ def words(light: str, level: str, meaning: str) -> str:
     counts = found["lights"][light][level]
     if level == "green":
         return f"Green means that {meaning}. That was true of {counts['right']} of the {counts['of']} green ones of {made}."
-    of_them = f"Of {made}, {counts['of']} had {level} here, and it was true of {counts['right']} of these all the same"
+    of_them = f"Of {made}, {counts['of']} had {level} here, and {counts['right']} of these were as good all the same"
     return f"Green means that {meaning}. {of_them}."

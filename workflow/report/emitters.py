@@ -20,17 +20,24 @@ def lamp_power(table: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def emitter_rows(table: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
-    """Return the rows of emitters.parquet of stage export as texts; the most powerful lamp first."""
+    """Return the rows of emitters.parquet of stage export as texts; the most powerful lamp first. Light from outside is one row,
+    the mean of its parts."""
     radiance, error = (np.stack([table[f"{of}_{c}"] for c in "rgb"], 1).astype(np.float64) for of in ("radiance", "error"))
     kept, area, power = table["kept"].astype(bool), table["kind"] == "area", lamp_power(table)
+    sky = kept & ~area
+    if sky.any():  # its mean, with the errors of its parts
+        radiance[sky], error[sky] = radiance[sky].mean(0), error[sky].mean(0)
     probability, rows = table.get("probability", np.full(len(power), -1.0)), []
+    outside = np.flatnonzero(kept & ~area)
     for i in np.argsort(-power, kind="stable"):
+        if kept[i] and not area[i] and i != outside[0]:
+            continue  # one row for all of it
         peak = radiance[i].max()
         swatch = color.to_uint8(color.srgb_from_linear(radiance[i] / peak if peak > 0 else radiance[i]))
         rows.append(
             {
                 "id": int(table["emitter_id"][i]),
-                "name": str(table["name"][i]),
+                "name": str(table["name"][i]) + (f", {len(outside)} parts" if i in outside and len(outside) > 1 else ""),
                 "object": str(table["object"][i]),
                 "kind": str(table["kind"][i]),
                 "faces": int(table["faces"][i]),
@@ -42,7 +49,7 @@ def emitter_rows(table: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
                 "share": percent(power[i] / power.sum(), 1) if area[i] and power.sum() > 0 else "–",
                 "power": f"{power[i]:.6g}",
                 "brightness": f"{radiance[i].sum():.6g}",
-                "observations": int(table["observations"][i]),
+                "observations": int(table["observations"][sky].sum() if sky[i] else table["observations"][i]),
                 "kept": bool(kept[i]),
                 "reason": str(table["reason"][i]),
             }

@@ -13,6 +13,7 @@ from workflow.report.reported import Reported
 from workflow.report.scores import found
 from workflow.report.verdict import Evidence
 from workflow.report.views import psnr_of_views
+from workflow.report.wording import percent
 
 LIKELY = 0.5
 """Probability from which an emitter is more likely a lamp than surface."""
@@ -44,6 +45,7 @@ def evidence_of(scene: Reported) -> Evidence:
     lamps = emitters["kept"].astype(bool) & (emitters["kind"] == "area")
     probability = emitters.get("probability", np.full(len(lamps), -1.0))
     unlikely, power = lamps & (probability >= 0) & (probability < LIKELY), lamp_power(emitters)
+    doubted = dict(zip(emitters["name"][unlikely].tolist(), probability[unlikely].tolist(), strict=True))
     alone = scene.document("reconstruction") if "reconstruction" in scene.readers else {}
     unplaced = len(alone.get("left_out", ()))
     scored = psnr_of_views(scene.readers["metrics"].table("metrics.parquet"))
@@ -74,8 +76,8 @@ def evidence_of(scene: Reported) -> Evidence:
         lost=sum(map(len, (capture.facts.get("dropped_views") or (), capture.facts.get("left_out_views") or ()))) + unplaced,
         photographed=float(cache[-1]) if cache else scene.document("plan").get("probes", {}).get("photographed_share"),
         stability=scene.document("segmentation").get("stability"),
-        lamps=int(np.count_nonzero(lamps)),
-        unlikely=int(np.count_nonzero(unlikely)),
+        lamps=len(set(emitters["name"][lamps].tolist())),
+        unlikely=[f"{name} ({percent(p)})" for name, p in doubted.items()],
         unlikely_power=float(power[unlikely].sum() / max(power[lamps].sum(), 1e-300)),
         environment=bool(np.any(recovered.light.environment)),
         doubtful_area=doubtful_area(light.table("emitters.parquet"), light.table("radiance_cache.parquet"), density),

@@ -18,6 +18,8 @@ from workflow.report.wording import percent
 
 GREEN, AMBER, RED = "green", "amber", "red"
 ORDER = (GREEN, AMBER, RED)
+NAMED = 3
+"""Doubtful lamps that a finding names."""
 WORDS = {GREEN: "good", AMBER: "doubtful", RED: "poor"}
 """A light in a word, so that no colour is needed to read it."""
 
@@ -100,7 +102,7 @@ MEANS: dict[str, Meaning] = {
     "materials": Meaning(
         {"albedo_scaled": 0.15},
         "the albedo of what photographs show is off by at most 0.15 of 1 (root mean square), after one factor on all of it; it"
-        " says nothing about roughness and metallic",
+        " promises nothing about roughness and metallic",
     ),
     "scale": Meaning({"level_factor": 1.35}, "albedo as a whole is right to within a factor of 1.35"),
 }
@@ -122,8 +124,8 @@ class Evidence:
         photographs: number of photographs; lost: how many were left out of those given.
         photographed: share of the surface met by rays from surface that photographs show.
         stability: of the objects; None also where objects are given.
-        lamps: emitters that were kept; unlikely: how many of them are more likely surface that reflects; unlikely_power: share
-            of the power of all lamps that these have.
+        lamps: number of lamps that were found, a window counted once; unlikely: those of them that are more likely surface that
+            reflects, each with its probability; unlikely_power: share of the power of all lamps that these have.
         environment: whether light from outside was found.
         doubtful_area: m^2 of what was taken for lamps without clear evidence (`evidence.doubtful_area`).
         misfit: of the light; light_spread: of the light against the truth.
@@ -156,7 +158,7 @@ class Evidence:
     photographed: float | None = None
     stability: float | None = None
     lamps: int = 0
-    unlikely: int = 0
+    unlikely: Sequence[str] = ()
     unlikely_power: float = 0.0
     environment: bool = False
     doubtful_area: float | None = None
@@ -270,12 +272,13 @@ def _doubts(e: Evidence) -> dict[str, str]:
 
 
 def _doubted(light: Light, doubts: Mapping[str, str]) -> Light:
-    """Return a light with the doubts of others, each in a sentence; all that they rest on, and what helps, stands there."""
+    """Return a light that is green by itself with the doubts of others, each in a sentence; all that they rest on, and what
+    helps, stands there."""
     added = [
         Finding(AMBER, f"The {name} {'is' if name == 'light' else 'are'} in doubt ({what}), and this may have the same cause",
                 f"See to the {name} first")
         for name, what in doubts.items()
-        if name != light.name or light.level == GREEN
+        if light.level == GREEN  # what is worse has its own reason, and two lights that send to each other help nobody
     ]  # fmt: skip
     return _made(light.name, light.question, [*light.findings, *added])
 
@@ -368,8 +371,8 @@ def _geometry(e: Evidence) -> Light:
     if e.confirmed is not None:  # nothing but the photographs judges this mesh, and they made it
         alone = Finding(
             AMBER,
-            f"Cameras and mesh were found from the photographs alone: several confirm the depth of {percent(e.confirmed)} of"
-            f" their pixels, and {e.built:.0f} m² of flat sides were built where they show none",
+            f"Cameras and mesh were found from the photographs alone: {percent(e.confirmed)} of their pixels have a depth that"
+            f" several photographs confirm, and {e.built:.0f} m² of flat sides were built where none shows any",
             "Look at the picture of cameras and mesh below, and at room.html from above: what has no texture may have holes."
             " Take more photographs of what is torn, or use the mesh of a scan (docs/guide/programs.md)",
         )  # fmt: skip
@@ -383,7 +386,8 @@ def _geometry(e: Evidence) -> Light:
         "Photograph the walls, floor and ceiling that are missing, each from three places, and add them"
         if e.confirmed is not None else
         "Close the mesh: scan the walls, floor and ceiling that it lacks, because they reflect light and keep light out."
-        " Sides made up by source.close help less than they cost in most rooms (docs/guide/own-data.md)", ".1%",
+        " Where that cannot be, use albedo with care, and do not relight: sides made up by source.close help less than they cost"
+        " in most rooms (docs/guide/own-data.md)", ".1%",
     )  # fmt: skip
     if alone and escape and escape.level == GREEN:  # the sides that were built let nothing out
         escape = None
@@ -393,18 +397,19 @@ def _geometry(e: Evidence) -> Light:
         [
             alone,
             made_up,
+            _finding(
+                "agreement", e.agreement, "Photographs of the same surface correlate by {} (median)",
+                FROM_PHOTOGRAPHS if alone else
+                "See whether each photograph stands with its own pose, then refine poses where they were made (COLMAP, the"
+                " phone's app); source.registration mends a few pixels",
+                ".2f",
+            ),
             escape,
             _finding(
                 "depth", e.depth, "Mesh and measured depth differ by {} (median)",
                 "Check unit, axes and frame of the mesh (source.unit, source.axes)", ".1%",
             ),
             edges,
-            _finding(
-                "agreement", e.agreement, "Photographs of the same surface correlate by {} (median)",
-                FROM_PHOTOGRAPHS if alone else
-                "Refine the poses where they were made (COLMAP, the phone's app); source.registration mends a few pixels",
-                ".2f",
-            ),
             _finding(
                 "photographed", e.photographed, "The photographs show {} of the surfaces that reflect light onto others",
                 "Photograph also what lies behind the camera: every wall, floor and ceiling", ".0%",
@@ -421,14 +426,12 @@ def _geometry(e: Evidence) -> Light:
 def _light(e: Evidence) -> Light:
     outside = "light from outside the mesh" if e.environment else ""
     counted = f"{e.lamps} {'lamp' if e.lamps == 1 else 'lamps'} found"
-    if e.lamps == e.unlikely > 0:
-        counted += ", each more likely bright surface"
-    elif e.unlikely:
-        one = "one of them is" if e.unlikely == 1 else f"{e.unlikely} of them are"
-        # Where a lamp hangs, and whether the light needs it, tell less than how it outshines the room, which is judged below.
-        counted += f"; {one}, by place and need, more likely bright surface, with {percent(e.unlikely_power)} of their power"
+    if e.unlikely:
+        more = f" and {len(e.unlikely) - NAMED} more" if len(e.unlikely) > NAMED else ""
+        counted += f"; less likely lamps than bright surface: {', '.join(e.unlikely[:NAMED])}{more}, with"
+        counted += f" {percent(e.unlikely_power)} of the power"
     look = "Look at the list of lamps below, and photograph each lamp and window from several sides"
-    if e.lamps > e.unlikely:
+    if e.lamps > len(e.unlikely):
         level = min(LIMITS["unlikely_power"].level(e.unlikely_power), AMBER, key=ORDER.index)
         also = f"{';' if e.unlikely else ' and'} {outside}{' lights the room too' if e.unlikely else ''}" if outside else ""
         lamps = Finding(level, f"{counted}{also}", "" if level == GREEN else look)
@@ -477,7 +480,7 @@ def _materials(e: Evidence) -> Light:
         held = _counted(e.held_out_views, "held-out photograph")
         each = np.array(e.held_out_each)
         ends = f" ({each.min():.1f} to {each.max():.1f})" if len(each) > 1 else ""
-        rival = "" if e.others is None else f", of which the mean of the other photographs has {e.others:.1f}"
+        rival = "" if e.others is None else f"; the mean of the other photographs, which knows no light, has {e.others:.1f} there"
         # Of a few photographs, one good one does not make up for most that are not.
         usual = min(e.held_out, float(np.median(each))) if len(each) else e.held_out
         scored = _finding(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,8 +17,9 @@ from workflow.settings import scene_origin
 from workflow.settings.names import did_you_mean
 
 
-def object_number(key: object, names: list[str], where: str) -> int:
-    """Return the id of the object that a key of the settings means: its name, or else its id, alone or as `piece 24`.
+def object_number(key: object, names: list[str], where: str, new: Iterable[str] = ()) -> int:
+    """Return the id of the object that a key of the settings means: its name, or else its id, alone or as `piece 24`; `new`:
+    names that people gave, which may be meant.
 
     Raises:
         InputError: there is no such object, or several have this name; `where` is the setting, for the message.
@@ -31,9 +33,11 @@ def object_number(key: object, names: list[str], where: str) -> int:
     number = re.fullmatch(r"(?:(?:piece|object) )?(\d+)", text)
     if number and int(number[1]) < len(names):
         return int(number[1])
-    hint = did_you_mean(text, names, "{!r}")
-    listed = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
-    raise InputError(f"{where}: there is no object {text!r}.{hint} Allowed: a name or an id of objects.parquet, such as {listed}")
+    every = [*dict.fromkeys(new), *names]
+    hint = did_you_mean(text, every, "{!r}")
+    listed = ", ".join(every[:8]) + (" ..." if len(every) > 8 else "")
+    ids = f"an id (0 to {len(names) - 1})" if names else "an id"
+    raise InputError(f"{where}: there is no object {text!r}.{hint} Allowed: {ids} or a name of objects.csv, such as {listed}")
 
 
 @lru_cache(None)
@@ -52,7 +56,7 @@ def check_overrides(stage: str, scene: str, quality: str) -> None:
     if reader is not None:
         names = object_names(reader)
         for key in wanted:
-            object_number(key, names, f"{scene_origin(scene)}: `materials`")
+            object_number(key, names, f"{scene_origin(scene)}: `materials`", new.values())
         renamed(names, new, f"{scene_origin(scene)}: `names`")
 
 

@@ -194,10 +194,11 @@ class Relighting(Section):
     emitters: Annotated[Light, BeforeValidator(_switched)] = 1.0
     """Recovered emitters that `lamps` does not name: `on`, `off`, or a factor on their radiance."""
     lamps: Annotated[dict[str, RelightLamp], TEXT_KEYS] = Field(default_factory=dict)
-    """Single lamps: id of emitters.parquet, or name of an object that shines -> factor, `on`, `off`, or its keys."""
+    """Single lamps: name as in the report (`window 1`) or of an object that shines, or id of emitters.parquet -> factor, `on`,
+    `off`, or its keys."""
     each: Literal["alone", "off"] | None = None
     """Instead of `emitters` and `lamps`: one picture for each of the twelve strongest lamps, with its light `alone`, or with all
-    but it (`off`). Names end with its `emitter_id`."""
+    but it (`off`). Names end with the lamp's."""
     environment: Literal["keep", "off"] | Light | Colour | Path = "keep"
     """Light from outside: `keep`, `off`, a factor on what was found, a uniform radiance `[r, g, b]`, or a latitude-longitude EXR
     (top row = up)."""

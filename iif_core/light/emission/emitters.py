@@ -60,6 +60,8 @@ SUSPECTS = 2
 """Families that stayed although white surface would be about as bright, of which it is traced what could take their place."""
 HIDDEN_POINTS = 32
 """Points of each hidden surface at which the light that falls on it is estimated."""
+OF_A_ROOM = 1.8
+"""Metres between what is below and above a lamp from which it hangs from a ceiling, and not from a cupboard over a worktop."""
 COMPARED_TILES_ACROSS = 8
 """Tiles across a picture whose pixels are averaged while emitters are compared: light changes slowly."""
 
@@ -287,7 +289,8 @@ def lamp_names(photos: Photographs, groups: EmitterGroups, radiance: np.ndarray)
     up = np.asarray(photos.up, np.float64)
     things = np.unique(owner[owner >= 0])
     overhead = np.zeros(scene.n_objects + 1, bool)  # the last for surface of no object
-    overhead[things] = heights(photos.tracer, scene, things, up) >= OVERHEAD
+    height, room = heights(photos.tracer, scene, things, up)
+    overhead[things] = (height >= OVERHEAD) & (room >= OF_A_ROOM)
     pieces = [Piece.of(scene.vertices, scene.faces[groups.of_face == g]) for g in range(groups.size)]
     power = np.where(groups.sides == 0, 2.0, 1.0) * groups.area * np.maximum(radiance, 0.0).sum(1)
     return place_names(pieces, up / np.linalg.norm(up), overhead[owner], groups.is_hidden, power)

@@ -82,8 +82,9 @@ class ObjectLooks:
         return (self.faces & ~hardly[scene.object_id]) | (scene.passes > 0)
 
 
-def heights(tracer: Tracer, scene: BaseScene, objects: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return how high the middle of each of `objects` (k,) is between what is below it and what is above it, (k,) in [0, 1].
+def heights(tracer: Tracer, scene: BaseScene, objects: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return how high the middle of each of `objects` (k,) is between what is below it and what is above it, (k,) in [0, 1], and
+    how far these are apart, (k,) metres.
 
     Where a ray meets nothing, the highest or the lowest point of the mesh stands for it. `up`: (3,) of any length above 0.
     """
@@ -114,7 +115,7 @@ def heights(tracer: Tracer, scene: BaseScene, objects: np.ndarray, up: np.ndarra
 
     ceiling = np.maximum(end(high - _STEP_OFF, 1.0, top), high)
     floor = np.minimum(end(low - _STEP_OFF, -1.0, bottom), low)
-    return np.clip((middle @ up - floor) / np.maximum(ceiling - floor, 1e-9), 0.0, 1.0)
+    return np.clip((middle @ up - floor) / np.maximum(ceiling - floor, 1e-9), 0.0, 1.0), ceiling - floor
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ class LampOdds:
         asked = np.flatnonzero(looks.is_saturated | (exists & ~seen))
         overhead = np.zeros(count, bool)
         if len(asked):
-            overhead[asked] = heights(photos.tracer, scene, asked, np.asarray(photos.up)) >= OVERHEAD
+            overhead[asked] = heights(photos.tracer, scene, asked, np.asarray(photos.up))[0] >= OVERHEAD
         likely = overhead & looks.is_saturated
         if scene.made_up is not None:  # what would come in through the openings that they close comes from them
             likely |= scene.made_up

@@ -489,11 +489,13 @@ class Alignment:
             return ""
         now, best = r["edge_correlation"], r["edge_correlation_best"]
         shift = max(map(abs, r["edge_best_shift"]))
-        weak = WEAK_BESIDE_DEPTH if self.depth_disagreement <= tolerance else WEAK_CORRELATION
+        # Depth that agrees speaks for the poses of the depth, not for those of the photographs.
+        is_mixed_up = r.get("edge_own_pose_standard_errors", np.inf) < CLEARLY_OWN
+        weak = WEAK_BESIDE_DEPTH if self.depth_disagreement <= tolerance and not is_mixed_up else WEAK_CORRELATION
         if now >= weak and not (shift >= SHIFT - 1 and best > 1.2 * now):
             return ""
         mixed_up = ""
-        if r.get("edge_own_pose_standard_errors", np.inf) < CLEARLY_OWN:
+        if is_mixed_up:
             mixed_up = (
                 f"; from the poses of other photographs they correlate {r['edge_correlation_other_poses']:.3f}, which is as much:"
                 " photographs may stand with each other's poses"

@@ -13,7 +13,7 @@ import numpy as np
 from iif_core.errors import InputError
 from workflow.intake import limits
 from workflow.intake.names import existing, fault_of_name, same_name, shown
-from workflow.intake.pictures import RAW
+from workflow.intake.pictures import EXTRAS, RAW
 from workflow.intake.raws import DEVELOP
 from workflow.sources.folder_scene import images
 
@@ -209,7 +209,7 @@ def _all_present(path: Path, root: Path, missing: list[Path]) -> None:
 def _elsewhere(path: Path, missing: Path) -> str:
     """Say in which folder beside the cameras a missing photograph lies, if it does."""
     wanted = same_name(missing.stem)
-    for folder in sorted(own for own in path.parent.iterdir() if own.is_dir()):
+    for folder in sorted(own for own in path.parent.iterdir() if own.is_dir() and own.name not in EXTRAS):
         if any(same_name(file.stem) == wanted and file.suffix.lower() in images.EXTENSIONS for file in folder.iterdir()):
             cure = "write it before the names" if path.suffix == ".json" else f"set `source.images: {folder.name}`"
             return f" There is one in {folder.name}/: {cure}"
