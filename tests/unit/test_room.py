@@ -82,14 +82,14 @@ def test_every_emitter_is_a_lamp_up_to_sixteen():
     few = find_lamps(many[:3], radiance[:3], np.float32([0.1, 0.2, 0.4]), names)
     assert [one.name for one in few.lamps] == ["lamp 0", "lamp 1", "lamp 2", "light from outside"]
     np.testing.assert_allclose([one.color for one in few.lamps], [[1, 0.5, 0.25]] * 3 + [[0.25, 0.5, 1]])
-    np.testing.assert_allclose(few.radiance, radiance[:3, :1].repeat(3, 1))  # white while it is traced
+    np.testing.assert_allclose(few.radiance, radiance[:3, :1].repeat(3, 1), rtol=1e-6)  # white while it is traced
     assert few.environment == 3 and few.surroundings.ravel().tolist() == pytest.approx([0.4] * 3)
     sun = np.float32([[[1, 2, 3], [0, 0, 0]], [[0, 0, 0], [0, 0, 9]]])
     all_of_them = find_lamps(many, radiance, sun, names)
     assert len(all_of_them.lamps) == 16 and all_of_them.environment == 15
     shared = all_of_them.lamps[14]
-    assert shared.emitters == tuple(range(6)) and shared.color.tolist() == [1, 1, 1]
-    np.testing.assert_allclose(all_of_them.radiance[:6], radiance[:6])  # with their own colours
+    assert shared.emitters == tuple(range(6)) and shared.color.tolist() == [1, 0.5, 0.25]
+    np.testing.assert_allclose(all_of_them.radiance[:6] * shared.color, radiance[:6], rtol=1e-6)
     np.testing.assert_array_equal(all_of_them.surroundings, sun)
     assert find_lamps([], np.zeros((0, 3)), np.zeros(3), []).lamps == []
 
@@ -102,7 +102,11 @@ def test_panes_of_a_window_are_one_lamp():
     names = ["window 1", "window 1", "lamp 1"]
     found = find_lamps(many, radiance, np.zeros(3), names)
     assert [(one.name, one.emitters) for one in found.lamps] == [("window 1", (0, 1)), ("lamp 1", (2,))]
-    np.testing.assert_allclose(found.radiance[:2], radiance[:2])  # each with its own colour
+    window = found.lamps[0].color
+    np.testing.assert_allclose(window, np.array([9, 10, 11]) / 11)  # by power, 2 to 4
+    np.testing.assert_allclose(found.radiance[:2] * window, radiance[:2], rtol=1e-6)  # each with its own colour
+    dark = find_lamps(many[:1], np.float32([[0, 2, 0]]), np.zeros(3), names)
+    np.testing.assert_allclose(dark.radiance[0] * dark.lamps[0].color, [0, 2, 0])
     assert found.of_emitter.tolist() == [0, 0, 1]
     alone = find_lamps(many, radiance * [[0], [1], [1]], np.zeros(3), names)
     assert [one.emitters for one in alone.lamps] == [(1,), (2,)] and alone.of_emitter.tolist() == [-1, 0, 1]

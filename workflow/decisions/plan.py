@@ -13,8 +13,8 @@ ESCAPE_PRIMARY = 1e-3
 ESCAPE_SECONDARY = 2e-3
 """The same for rays from the surface."""
 CRACKS = 2.0
-"""Standard errors by which photographs must gain from light that comes through a closed mesh: its cracks fit any colour that lamps
-lack."""
+"""Standard errors by which photographs must gain from light that comes through a closed mesh: its cracks fit any colour that
+lamps lack."""
 ESCAPE_BRIGHTNESS = 0.02
 """Brightness of escaping camera rays, relative to the photographs, up to which the outside counts as black."""
 ESCAPE_LIGHT = 0.01

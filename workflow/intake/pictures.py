@@ -120,6 +120,8 @@ def opened(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Any]:
         except Image.DecompressionBombError as error:
             raise InputError(f"{path}: too many pixels ({error}); allowed are {limits.PICTURE_PIXELS}") from None
         except UnidentifiedImageError:
+            if not path.stat().st_size:
+                raise InputError(f"{path}: not a readable image (the file is empty); copy it again") from None
             kinds = ", ".join(allowed)
             why = f"its content is none of {kinds}, whatever its name"
             raise InputError(f"{path}: not a readable image ({why}); save it as one of them") from None

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from iif_core.light.emission.odds import DOUBTFUL
 from iif_core.light.emission.options import EmissionOptions
 from workflow.decisions import numerics
 from workflow.report.emitters import lamp_power
@@ -15,8 +16,6 @@ from workflow.report.verdict import Evidence
 from workflow.report.views import psnr_of_views
 from workflow.report.wording import percent
 
-LIKELY = 0.5
-"""Probability from which an emitter is more likely a lamp than surface."""
 NUMERICS = ("base", "emission", "shading", "affines")
 """Stages that say where their arithmetic came close to its end."""
 BRIGHT = 12.0
@@ -44,7 +43,7 @@ def evidence_of(scene: Reported) -> Evidence:
     fitted = scene.readers["affines"]
     lamps = emitters["kept"].astype(bool) & (emitters["kind"] == "area")
     probability = emitters.get("probability", np.full(len(lamps), -1.0))
-    unlikely, power = lamps & (probability >= 0) & (probability < LIKELY), lamp_power(emitters)
+    unlikely, power = lamps & (probability >= 0) & (probability < DOUBTFUL), lamp_power(emitters)
     doubted = dict(zip(emitters["name"][unlikely].tolist(), probability[unlikely].tolist(), strict=True))
     alone = scene.document("reconstruction") if "reconstruction" in scene.readers else {}
     unplaced = len(alone.get("left_out", ()))

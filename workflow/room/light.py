@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
+FAINTEST = 1e-3
+"""Least channel of the colour of a lamp, over its largest."""
 BESIDE = 2.0
 """A texel next to a chart takes the light of the nearest texel of its part up to this distance, in texels. A difference of the
 normals of `NORMAL_REACH` counts as one texel."""
@@ -48,8 +50,8 @@ class Lamp:
     Attributes:
         name: for people.
         emitters: ids of its emitters; empty = the environment.
-        color: (3,) linear, largest 1: factor on the light of the map. White where the map has its own colours, because several
-            emitters or the texels of the environment differ.
+        color: (3,) linear, largest 1: factor on the light of the map, the mean colour of its emitters. White for an environment
+            that differs from texel to texel.
         radiance: (3,) mean radiance of its surface, or of the environment over all directions.
         power: of all its light, in m^2 sr of radiance; of the environment, as much as enters through surface that is missing is
             not known, so that it is 0.
@@ -109,8 +111,8 @@ def find_lamps(parts: Sequence[TexturedPart], radiance: Array, environment: Arra
         own = np.flatnonzero(of_emitter == number)
         total = power[own].sum()
         mean = (power[own, None] * radiance[own]).sum(0) / total
-        color = _color(radiance[own[0]]) if len(own) == 1 else np.ones(3)
-        traced[own] = radiance[own].max(1, keepdims=True) if len(own) == 1 else radiance[own]
+        color = np.maximum(_color(mean), FAINTEST)
+        traced[own] = radiance[own] / color
         own_names = {names[e] for e in own}
         name = own_names.pop() if len(own_names) == 1 else f"{len(own)} weak emitters together"
         lamps.append(Lamp(name, tuple(int(e) for e in own), color, mean, float(total)))

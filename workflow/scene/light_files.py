@@ -10,7 +10,7 @@ from iif_core.camera.calibration.choice import CalibratedResponse, calibration_f
 from iif_core.camera.response import response_facts
 from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.find import FoundLight
-from iif_core.light.emission.odds import LampEvidence
+from iif_core.light.emission.odds import DOUBTFUL, LampEvidence
 from workflow.decisions import light as decisions
 from workflow.decisions import numerics
 from workflow.decisions.record import Decision
@@ -152,7 +152,7 @@ def _write_facts(
     if level_raised > 0:
         raised = f"light raised {np.exp(level_raised):.2f} times so that albedos are at most 1"
         notes.append(f"{raised}; the error of its level does not contain that")
-    doubtful = light.evidence.probability < 0.5 if light.evidence else np.zeros(0, bool)
+    doubtful = light.evidence.probability < DOUBTFUL if light.evidence else np.zeros(0, bool)
     if doubtful.any():
         area = f"{found.groups.area[doubtful].sum():.2g} m^2"
         what = "more likely surface that light falls on or passes through than lamps"

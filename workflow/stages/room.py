@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from iif_core.light.emission.odds import DOUBTFUL
 from iif_core.light.light_maps import to_half
 from workflow.exporters.atlas import bake, encoded, read_parts
 from workflow.exporters.glb import JPEG_QUALITY, glb_bytes
@@ -20,13 +21,20 @@ from workflow.room.unlit import unlit_picture
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_environment_seen
 from workflow.scene.normal_form import CaptureReader
-from workflow.scene.recovered import read_recovered
+from workflow.scene.recovered import Recovered, read_recovered
 
 MAX_BOUNCES = 16  # of a path
 TEXTURE_SIZE = 2048  # largest side of the textures in the page, in texels
 _SEEDS = 0x726F6F6D  # keeps the random streams of this stage apart from those of others
 FILL = 0.6
 """Share of the texels of an atlas that have surface, about."""
+
+
+def _called(job: Job, recovered: Recovered) -> list[str]:
+    """Return the names of emitters as the page shows them: what is more likely surface than a lamp says so."""
+    probability = job.read("emission").table("emitters.parquet").get("probability", ())
+    doubtful = {name for name, p in zip(recovered.emitter_names, probability, strict=False) if 0 <= p < DOUBTFUL}
+    return [f"{name} (doubtful)" if name in doubtful else name for name in recovered.emitter_names]
 
 
 def run(job: Job) -> None:
@@ -39,7 +47,7 @@ def run(job: Job) -> None:
         parts = read_parts(job.read("unwrap"), recovered)
         uncertainty = job.read("affines").table("cells.parquet", ("uncertainty",))["uncertainty"]
         atlas = bake(parts, recovered, uncertainty, job.read("unwrap").json("unwrap.json")["size"])
-        lamps = find_lamps(parts, recovered.emitter_radiance, recovered.light.environment, recovered.emitter_names)
+        lamps = find_lamps(parts, recovered.emitter_radiance, recovered.light.environment, _called(job, recovered))
         size = build.lightmap_size(wanted.lightmap_size, len(lamps.lamps), FILL, wanted.max_mb)
         texels = lit_texels(parts, size)
     job.log.info("%d lamps, light maps of %d x %d, %d texels with surface", len(lamps.lamps), size, size, len(texels.index))

@@ -25,6 +25,8 @@ WORTH = 15.0
 PROBABILITY = (-3.5, 2.15, 2.65, 2.2, 4.3)
 """Logarithm of the odds that what was found to shine is a lamp: constant, and what counts that it is likely, saturated,
 seen by no camera, and needed."""
+DOUBTFUL = 0.5
+"""Probability of a lamp below which it is more likely surface that light falls on or passes through."""
 _NEEDED = (-0.05, 1.0)
 """Limits of the logarithm of the growth of the misfit without it."""
 _STEP_OFF = 0.01
@@ -192,4 +194,4 @@ class LampEvidence:
     @property
     def is_unlikely(self) -> np.ndarray:
         """(G,) bool: by its looks alone, without what it is needed for, it is more probably no lamp."""
-        return replace(self, needed=np.zeros(len(self.needed))).probability < 0.5
+        return replace(self, needed=np.zeros(len(self.needed))).probability < DOUBTFUL

@@ -97,7 +97,7 @@ def _header(path: Path, _stamp: tuple[int, int]) -> Header:
         raw = raw_header(path)
         stated = dict(zip((tag for tag, _ in _EXPOSURE_TAGS), (value or None for value in raw.exposure), strict=True))
         return Header(raw.size, raw.orientation, _stated_exposure(stated))
-    with reading(path, "not a readable image"):
+    with reading(path, "not a readable image", "; copy it again"):
         with opened(path) as image:
             if image.mode not in MODES:
                 raise InputError(f"{path}: colour mode {image.mode}; allowed: grey, RGB, RGBA of 8 or 16 bits. Convert it")
@@ -133,7 +133,7 @@ def exif_upright(path: Path) -> tuple[bytes, tuple[str, float]]:
     is_raw = path.suffix.lower() in RAW
     if is_raw and not _is_tiff(path):
         return b"", ("", raw_header(path).focal)
-    with reading(path, "not a readable image"), opened(path, ("TIFF",) if is_raw else FORMATS) as image:
+    with reading(path, "not a readable image", "; copy it again"), opened(path, ("TIFF",) if is_raw else FORMATS) as image:
         found = image.getexif()
         own = found.get_ifd(_PHOTO_IFD)
         kept = Image.Exif()
@@ -174,7 +174,7 @@ def _stated_exposure(photo: Mapping[int, Any]) -> Stated | None:
 
 def header(path: Path) -> Header:
     """Size and orientation from the file's header; what is unreadable, CMYK, cut short or too large is refused by name."""
-    with reading(path, "not a readable image"):
+    with reading(path, "not a readable image", "; copy it again"):
         status = path.stat()
     return _header(path, (status.st_size, status.st_mtime_ns))
 

@@ -132,8 +132,9 @@ def _facts(names: Mapping[str, int], found: Registration, scale: float) -> dict[
 def _words(found: Registration, moved: float, plain: bool) -> list[str]:
     numbers = (
         f"at edges of the mesh photographs have edges of {found.edges[1]:.3f} instead of {found.edges[0]:.3f}"
-        f" (+- {found.edge_error:.4f}), and on surface that was left aside for this they differ by {found.held_out[1]:.3f}"
-        f" instead of {found.held_out[0]:.3f} (a gain of {found.gain:+.4f} +- {found.error:.4f})"
+        f" (+- {found.edge_error:.4f}), and on surface that was left aside for this they spread by {found.held_out[1]:.3f}"
+        f" instead of {found.held_out[0]:.3f} (fall of the loss {found.gain:+.4f} +- {found.error:.4f}); both together speak for"
+        f" it by {found.evidence:.1f} standard errors, {found.needed:.1f} are needed"
     )
     if not found.accepted:
         return [f"registration: poses and intrinsics are taken as given. Moved by {moved:.1f} pixels, {numbers}: no clear gain"]
