@@ -18,6 +18,8 @@ COVERAGE_ERROR = 0.05
 """By which shares of pixels may be wrong: few rays, and edges of a mesh that are not quite where the photograph has them."""
 HIGH_BOUND = 0.9
 """Quantile of the lower bounds of a lamp that its radiance exceeds for certain; the highest few may be noise."""
+BLOCKED = 0.5
+"""Share of that quantile below which a view shows something before the lamp."""
 ANCHOR_PIXELS = 64
 """At least this many directly seen pixels of each group enter the solve."""
 
@@ -59,9 +61,9 @@ class EmissionPixels(Rows):
 
         Compression, blur, noise and wrong poses lower some of the pixels of a saturated lamp to below saturation. They would be
         taken for its radiance, against everything that the other pixels say; what they show is still less than it. A shorter
-        exposure shows the radiance itself, which no bound exceeds: views that have no bound in the channel, and in every channel
-        some bound or a median of at least the `HIGH_BOUND` quantile of the bounds, stay as they are. A view that is dark in one
-        of these channels shows something before the lamp that the mesh lacks.
+        exposure shows the radiance itself, which no bound exceeds: views that have no bound in the channel, and a median of at
+        least the `HIGH_BOUND` quantile of the bounds, stay as they are. A view that has less than `BLOCKED` of that in any such
+        channel shows something before the lamp that the mesh lacks.
         """
         bound = self.bound.copy()
         for group in np.unique(self.group[self.group >= 0]):
@@ -71,9 +73,9 @@ class EmissionPixels(Rows):
             least = np.array([np.quantile(shown[known[:, c], c], HIGH_BOUND) for c in mostly])
             for view in np.unique(self.view[own]):
                 here = self.view[own] == view
-                has_bound = known[here][:, mostly].any(0)
-                shows_lamp = (has_bound | (np.median(shown[here][:, mostly], 0) >= least)).all()
-                bound[np.ix_(own[here], mostly)] |= has_bound | ~shows_lamp
+                has_bound, median = known[here][:, mostly].any(0), np.median(shown[here][:, mostly], 0)
+                is_blocked = (~has_bound & (median < BLOCKED * least)).any()
+                bound[np.ix_(own[here], mostly)] |= has_bound | (median < least) | is_blocked
         return replace(self, bound=bound)
 
     @property
