@@ -158,11 +158,11 @@ def test_the_only_lamp_alone_is_the_room_and_without_it_the_room_is_dark(toy):
         toy, {"name": "found"}, {"name": "alone", "each": "alone"}, {"name": "no", "each": "off"}
     )
     names = sorted(path.name for path in folder.iterdir() if path.is_dir())
-    assert names == ["alone_0", "found", "no_0"]
+    assert names == ["alone_ceiling_light_1", "found", "no_ceiling_light_1"]
     np.testing.assert_allclose(alone, found, rtol=1e-5)
     assert found.any() and not without.any()
-    with refused("config/scenes/toy.yaml", "alone_0"):
-        lit(toy, {"name": "alone_0"}, {"name": "alone", "each": "alone"})
+    with refused("config/scenes/toy.yaml", "alone_ceiling_light_1"):
+        lit(toy, {"name": "alone_ceiling_light_1"}, {"name": "alone", "each": "alone"})
 
 
 def test_flight_denoised_and_lamp_that_moves(toy):

@@ -207,7 +207,7 @@ def test_missing_files_are_named(copy, gone, names):
         ("scans/mesh_aligned_0.05.ply", b"<!DOCTYPE html>", ["PLY", "b'<!DOCTYPE html>'"]),
         ("scans/mesh_aligned_0.05.ply", 0, [0]),
         ("scans/mesh_aligned_0.05.ply", 0.1, ["vertex", "face"]),
-        ("dslr/resized_anon_masks/DSC00001.png", 0, ["PNG, JPEG"]),
+        ("dslr/resized_anon_masks/DSC00001.png", 0, ["empty"]),
         ("dslr/resized_anon_masks/DSC00001.png", 0.5, []),
     ],
 )
