@@ -51,8 +51,8 @@ def content():
     ]  # fmt: skip
     emitter = {
         "id": 0, "name": "light", "object": "lamp", "kind": "area", "faces": 2, "area": 0.5, "radiance": "4, 4, 3",
-        "error": "1, 1, 1", "swatch": "#ffffcc", "share": "99 %", "probability": "93 %", "power": "5", "brightness": "11", "observations": 70,
-        "kept": True, "reason": "",
+        "error": "1, 1, 1", "swatch": "#ffffcc", "share": "99 %", "probability": "93 %", "power": "5", "brightness": "11",
+        "observations": 70, "kept": True, "reason": "",
     }  # fmt: skip
     line = np.linspace(0, 1, 5)
     return Page(
