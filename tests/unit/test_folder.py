@@ -718,13 +718,17 @@ def test_photographs_with_the_poses_of_others_are_doubted(order, warned):
     """Rooms of blocks: every photograph has edges where its own depth has them."""
     rng = np.random.default_rng(3)
     blocks = [np.kron(rng.random((n + 3, n + 4)), np.ones((120 // (n + 3), 160 // (n + 4)))) for n in order]
-    blocks = [block[:100, :140] for block in blocks]
+    alike = np.kron(rng.random((2, 2)), np.ones((50, 70)))  # what all rooms have in common
+    blocks = [block[:100, :140] + alike for block in blocks]
     normal, valid = np.broadcast_to(np.array([0, 0, 1.0]), (*blocks[0].shape, 3)), np.ones(blocks[0].shape, bool)
     found = alignment.Alignment.empty()
     for i, j in enumerate(order):
         photo = np.repeat(blocks[j][..., None], 3, -1).astype(np.float32)
         found.add_edges(str(i), *alignment.edge_pictures(photo, valid, (1 + blocks[i]).astype(np.float32), normal), True)
     assert (found.edge_warning(0.05) != "") == warned
+    # Measured depth that agrees with the mesh says nothing for the photographs.
+    found.ratios["0"] = np.ones(1000)
+    assert found.depth_disagreement == 0.0 and (found.edge_warning(0.05) != "") == warned
     assert (found.report()["edge_own_pose_standard_errors"] < alignment.CLEARLY_OWN) == warned
 
 

@@ -527,18 +527,32 @@ def test_a_lamp_on_several_objects_is_called_as_it_is_shown():
 
 
 def test_the_panes_of_a_window_are_called_together():
-    """Also where an object has the name of a lamp that is on another one."""
     lamps = [Lamp(0, (1,), 1.0, "window 1"), Lamp(1, (2,), 1.0, "window 1"), Lamp(4, (3,), 1.0, "lamp 1")]
-    room = Inventory(["wall", "pane", "pane", "window 1"], lamps)
+    room = Inventory(["wall", "pane", "pane", "bulb"], lamps)
     assert room.lamps_called("window 1", "x") == [0, 1] and room.lamps_called("lamp 1", "x") == [2]
     with refused("relight.lamps", "'window 2'", "'window 1'", "window 1, lamp 1;"):
         room.lamps_called("window 2", "relight.lamps")
     with refused("relight.lamps", "'light from outside'", "environment: off"):
         room.lamps_called("light from outside", "relight.lamps")
     found = room.expanded([entry(each="alone")])
-    assert [(one["name"], list(one["lamps"])) for one in found] == [("a_window_1", ["window 1"]), ("a_lamp_1", ["lamp 1"])]
+    assert [(one["name"], list(one["lamps"])) for one in found] == [
+        ("a_window_1", ["emitter 0", "emitter 1"]),
+        ("a_lamp_1", ["emitter 4"]),
+    ]
     for one in found:
         room.check(one)
+
+
+def test_a_name_that_means_two_things_is_refused():
+    """An object is called as a lamp that is on another one; where both are the same lamps nothing is in doubt."""
+    room = Inventory(["wall", "pane", "window 1"], [Lamp(0, (1,), 1.0, "window 1"), Lamp(4, (2,), 1.0, "lamp 1")])
+    with refused("relight.lamps", "'window 1'", "emitter 0, emitter 4"):
+        room.lamps_called("window 1", "relight.lamps")
+    assert room.lamps_called("emitter 4", "x") == [1] and room.lamps_called("lamp 1", "x") == [1]
+    for one in room.expanded([entry(each="off")]):
+        room.check(one)
+    same = Inventory(["window 1"], [Lamp(0, (0,), 1.0, "window 1")])
+    assert same.lamps_called("window 1", "x") == [0]
 
 
 def test_lamps_are_called_by_object_or_id(things):

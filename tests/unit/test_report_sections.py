@@ -146,6 +146,12 @@ def test_lamps_are_told_by_their_power():
     table |= {f"radiance_{c}": [2.0, 3.0, 9.0] for c in "rgb"} | {f"error_{c}": [0.1] * 3 for c in "rgb"}
     rows = emitter_rows({name: np.array(column) for name, column in {**table, "reason": [""] * 3}.items()})
     assert [row["name"] for row in rows] == ["y", "x", "z"]
+    # A second part of the light from outside shares the row of the first.
+    more = {name: np.append(column, column[-1]) for name, column in {**table, "reason": [""] * 3}.items()}
+    more["radiance_r"] = np.array([2.0, 3.0, 9.0, 5.0])
+    joined = emitter_rows(more)
+    assert [row["name"] for row in joined] == ["y", "x", "z, 2 parts"]
+    assert joined[2]["radiance"].startswith("7") and joined[2]["observations"] == 6 and joined[2]["share"] == "–"
     assert [(row["id"], row["share"]) for row in rows] == [(5, "75.0 %"), (4, "25.0 %"), (6, "–")]  # both sides of b shine
     assert {row["probability"] for row in rows} == {"–"}  # light of another solver
     table |= {"reason": [""] * 3, "probability": [0.932, 0.051, -1.0]}

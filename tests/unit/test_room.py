@@ -5,6 +5,7 @@ import hashlib
 import io
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from workflow.room.light import backdrop, find_lamps, lit_texels, trace_lamps
 from workflow.room.pack import array_blob, normals_to_bytes, quantized
 from workflow.room.page import NOTES, Page, policy, render_page, three_version
 from workflow.room.sources import LIBRARY, VENDORED, VIEWER
+from workflow.stages.room import _called
 
 
 def part(mesh, column, columns, name, object_id, emitter_id=-1, radiance=(0, 0, 0), double_sided=False):
@@ -110,6 +112,15 @@ def test_panes_of_a_window_are_one_lamp():
     assert found.of_emitter.tolist() == [0, 0, 1]
     alone = find_lamps(many, radiance * [[0], [1], [1]], np.zeros(3), names)
     assert [one.emitters for one in alone.lamps] == [(1,), (2,)] and alone.of_emitter.tolist() == [-1, 0, 1]
+
+
+def test_doubtful_lamps_say_so_and_what_nothing_is_known_of_does_not():
+    def called(**columns):
+        job = SimpleNamespace(read=lambda stage: SimpleNamespace(table=lambda name: {k: np.array(v) for k, v in columns.items()}))
+        return _called(job, SimpleNamespace(emitter_names=["window 1", "window 1", "lamp 1", "lamp 2"]))
+
+    assert called(probability=[0.7, 0.7, 0.3, -1.0]) == ["window 1", "window 1", "lamp 1 (doubtful)", "lamp 2"]
+    assert called() == ["window 1", "window 1", "lamp 1", "lamp 2"]  # of another solver
 
 
 def test_what_no_photograph_shows_outside_is_grey():

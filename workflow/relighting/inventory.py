@@ -13,13 +13,11 @@ import numpy as np
 from iif_core.errors import InputError
 from iif_core.numerics.color import luminance
 from workflow.artifacts import StageReader
-from workflow.scene.named import object_names, object_number, renamed
+from workflow.scene.named import OUTSIDE, object_names, object_number, renamed
 from workflow.settings.names import did_you_mean
 
 Array = np.ndarray
 
-OUTSIDE = "light from outside"
-"""What reports and room pages call the light that the environment sends in."""
 MOST_EACH = 12
 """Lamps of which a relighting with `each` makes pictures."""
 
@@ -72,10 +70,6 @@ class Inventory:
         more = f" and {len(lamp.objects) - 1} more" if len(lamp.objects) > 1 else ""
         return f"{(self.shown or self.names)[lamp.objects[0]]}{more}"
 
-    def key_of(self, lamp: Lamp) -> str:
-        """Return the key of the settings that means a lamp as people see it: its name, or its id where it has none."""
-        return lamp.name or f"emitter {lamp.emitter_id}"
-
     def is_called(self, number: int, key: str) -> bool:
         """Return whether a key of the settings is the name of an object, as people see it or as the segmentation gave it."""
         return key == self.names[number] or key in self.shown[number : number + 1]
@@ -85,15 +79,21 @@ class Inventory:
         called so), all of that name (`window 1`), one as `name_of` calls it, or all on objects of that name.
 
         Raises:
-            InputError: there is no such lamp, or the object does not shine; `where` is the setting, for the message.
+            InputError: there is no such lamp, the object does not shine, or the key means different lamps by place and by object;
+                `where` is the setting, for the message.
         """
         exact = re.fullmatch(r"emitter (\d+)", key)
         if exact and any(lamp.emitter_id == int(exact[1]) for lamp in self.lamps):
             return [i for i, lamp in enumerate(self.lamps) if lamp.emitter_id == int(exact[1])]
         placed = [i for i, lamp in enumerate(self.lamps) if lamp.name == key]
-        called = placed or [i for i, lamp in enumerate(self.lamps) if lamp.objects and key == self.name_of(lamp)]
-        by_name = called or [i for i, lamp in enumerate(self.lamps) if any(self.is_called(o, key) for o in lamp.objects)]
-        found = by_name or [i for i, lamp in enumerate(self.lamps) if key == str(lamp.emitter_id)]
+        called = [i for i, lamp in enumerate(self.lamps) if lamp.objects and key == self.name_of(lamp)]
+        on_object = called or [i for i, lamp in enumerate(self.lamps) if any(self.is_called(o, key) for o in lamp.objects)]
+        if placed and on_object and placed != on_object:
+            ids = [f"emitter {self.lamps[i].emitter_id}" for i in sorted({*placed, *on_object})]
+            raise InputError(
+                f"{where}: {key!r} is the name of a lamp, and of an object on which others are; use {', '.join(ids)}"
+            )
+        found = placed or on_object or [i for i, lamp in enumerate(self.lamps) if key == str(lamp.emitter_id)]
         if found:
             return found
         each = dict.fromkeys(lamp.name or f"{lamp.emitter_id} ({self.name_of(lamp)})" for lamp in self.lamps)
@@ -108,10 +108,10 @@ class Inventory:
 
     def expanded(self, entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
         """Return dumped relightings, those with `each` as one for each of the strongest lamps, the strongest first."""
-        power: dict[str, float] = {}
+        of_name: dict[str, list[Lamp]] = {}
         for lamp in self.lamps:
-            power[self.key_of(lamp)] = power.get(self.key_of(lamp), 0.0) + lamp.power
-        strongest = sorted(power, key=lambda key: -power[key])[:MOST_EACH]
+            of_name.setdefault(lamp.name or str(lamp.emitter_id), []).append(lamp)
+        strongest = sorted(of_name.items(), key=lambda item: -sum(lamp.power for lamp in item[1]))[:MOST_EACH]
         out = []
         for entry in entries:
             if not entry["each"]:
@@ -119,9 +119,11 @@ class Inventory:
                 continue
             rest, own = (0.0, 1.0) if entry["each"] == "alone" else (1.0, 0.0)
             outside = "off" if entry["each"] == "alone" and entry["environment"] == "keep" else entry["environment"]
-            for key in strongest:
-                lamps = {key: {"factor": own, "colour": None, "move": None}}
-                name = f"{entry['name']}_{key.removeprefix('emitter ').replace(' ', '_')}"
+            for called, members in strongest:
+                # By id, which means one lamp however objects are called.
+                change = {"factor": own, "colour": None, "move": None}
+                lamps = {f"emitter {lamp.emitter_id}": change for lamp in members}
+                name = f"{entry['name']}_{called.replace(' ', '_')}"
                 out.append(entry | {"name": name, "each": None, "emitters": rest, "lamps": lamps, "environment": outside})
         return out
 

@@ -24,20 +24,18 @@ def emitter_rows(table: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
     the mean of its parts."""
     radiance, error = (np.stack([table[f"{of}_{c}"] for c in "rgb"], 1).astype(np.float64) for of in ("radiance", "error"))
     kept, area, power = table["kept"].astype(bool), table["kind"] == "area", lamp_power(table)
-    sky = kept & ~area
-    if sky.any():  # its mean, with the errors of its parts
-        radiance[sky], error[sky] = radiance[sky].mean(0), error[sky].mean(0)
-    probability, rows = table.get("probability", np.full(len(power), -1.0)), []
     outside = np.flatnonzero(kept & ~area)
-    for i in np.argsort(-power, kind="stable"):
-        if kept[i] and not area[i] and i != outside[0]:
-            continue  # one row for all of it
+    if len(outside):
+        radiance[outside], error[outside] = radiance[outside].mean(0), error[outside].mean(0)
+    probability, rows = table.get("probability", np.full(len(power), -1.0)), []
+    for i in np.setdiff1d(np.argsort(-power, kind="stable"), outside[1:], assume_unique=True):
+        parts = outside if i in outside else np.array([i])
         peak = radiance[i].max()
         swatch = color.to_uint8(color.srgb_from_linear(radiance[i] / peak if peak > 0 else radiance[i]))
         rows.append(
             {
                 "id": int(table["emitter_id"][i]),
-                "name": str(table["name"][i]) + (f", {len(outside)} parts" if i in outside and len(outside) > 1 else ""),
+                "name": str(table["name"][i]) + (f", {len(parts)} parts" if len(parts) > 1 else ""),
                 "object": str(table["object"][i]),
                 "kind": str(table["kind"][i]),
                 "faces": int(table["faces"][i]),
@@ -49,7 +47,7 @@ def emitter_rows(table: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
                 "share": percent(power[i] / power.sum(), 1) if area[i] and power.sum() > 0 else "–",
                 "power": f"{power[i]:.6g}",
                 "brightness": f"{radiance[i].sum():.6g}",
-                "observations": int(table["observations"][sky].sum() if sky[i] else table["observations"][i]),
+                "observations": int(table["observations"][parts].sum()),
                 "kept": bool(kept[i]),
                 "reason": str(table["reason"][i]),
             }

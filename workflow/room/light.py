@@ -17,6 +17,7 @@ from iif_core.surface.triangles import face_geometry
 from workflow.exporters.atlas import TexturedPart, joined, texels_beside, texels_of
 from workflow.models.denoise import denoise
 from workflow.runtime import device
+from workflow.scene.named import OUTSIDE
 
 if TYPE_CHECKING:
     from iif_core.light.transport.geometry import Geometry
@@ -119,7 +120,7 @@ def find_lamps(parts: Sequence[TexturedPart], radiance: Array, environment: Arra
     if shines:
         even = outside.shape[:2] == (1, 1)
         mean = np.average(outside.reshape(-1, 3), 0, solid_angles(*outside.shape[:2]).ravel()).astype(np.float64)
-        lamps.append(Lamp("light from outside", (), _color(mean) if even else np.ones(3), mean, 0.0))
+        lamps.append(Lamp(OUTSIDE, (), _color(mean) if even else np.ones(3), mean, 0.0))
         outside = np.full_like(outside, outside.max()) if even else outside
     return Lamps(lamps, of_emitter, traced.astype(np.float32), len(lamps) - 1 if shines else -1, outside)
 

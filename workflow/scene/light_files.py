@@ -16,6 +16,7 @@ from workflow.decisions import numerics
 from workflow.decisions.record import Decision
 from workflow.runtime.job import Job
 from workflow.scene.emission_views import gain_plan
+from workflow.scene.named import OUTSIDE
 from workflow.scene.normal_form import CaptureReader
 
 UNKNOWN = -1.0
@@ -126,7 +127,7 @@ def _table(light: FoundLight) -> dict[str, Any]:
         kind=["area"] * groups.size + ["environment"] * outside + ["area"] * out,
         side=np.r_[groups.sides, np.zeros(outside, np.int32), left_out.sides],
         evidence=light.evidence,
-        name=[*light.names, *["light from outside"] * outside, *light.left_on],
+        name=[*light.names, *[OUTSIDE] * outside, *light.left_on],
     )
 
 

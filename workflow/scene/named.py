@@ -16,6 +16,9 @@ from workflow.runtime.job import Job
 from workflow.settings import scene_origin
 from workflow.settings.names import did_you_mean
 
+OUTSIDE = "light from outside"
+"""What people read for the light that the environment sends in."""
+
 
 def object_number(key: object, names: list[str], where: str, new: Iterable[str] = ()) -> int:
     """Return the id of the object that a key of the settings means: its name, or else its id, alone or as `piece 24`; `new`:
