@@ -17,6 +17,7 @@ import resource
 import select
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -205,13 +206,14 @@ def _answers(cases: list[tuple[str, int]], seed: int, pristine: Pristine, scratc
     child = os.fork()
     if child == 0:
         try:
+            os.setsid()  # its own forks are of its group, and end with it
             os.close(receive)
             _child(cases, seed, pristine, home, send)
         finally:
             os._exit(0)
     os.close(send)
     said, deadline, late = b"", time.monotonic() + WALL_SECONDS, False
-    while not late:
+    while not late and said.count(b"\n") < len(cases):
         late = not select.select([receive], [], [], max(0, deadline - time.monotonic()))[0]
         part = b"" if late else os.read(receive, 1 << 16)
         if not part:
@@ -219,8 +221,8 @@ def _answers(cases: list[tuple[str, int]], seed: int, pristine: Pristine, scratc
         said += part
         if part.endswith(b"\n"):
             deadline = time.monotonic() + WALL_SECONDS
-    if late:
-        os.kill(child, signal.SIGKILL)
+    with contextlib.suppress(ProcessLookupError):  # and what it started; if it has ended already, its status stays
+        os.killpg(child, signal.SIGKILL)
     os.close(receive)
     _, status = os.waitpid(child, 0)
     answers = [json.loads(line) for line in said.split(b"\n")[: said.count(b"\n")]]
@@ -290,6 +292,33 @@ def ready(targets: dict[str, Target] = TARGETS) -> Iterator[Run]:
         sys.dont_write_bytecode = before[1]
         if before[0]:  # the variant of other tests in this process
             mitsuba.set_variant(before[0])
+
+
+@contextlib.contextmanager
+def apart() -> Iterator[Run]:
+    """As `ready` with all kinds, in a process that has no threads yet: what a thread held when its process forked, the fork waits
+    for in vain."""
+    command = [sys.executable, "-m", "tests.fuzz.runner", "--serve"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin and process.stdout
+        asked, told = process.stdin, process.stdout
+
+        def run(cases: list[tuple[str, int]], seed: int) -> Iterator[Result]:
+            asked.write(json.dumps([cases, seed]) + "\n")
+            asked.flush()
+            for _ in cases:
+                yield Result(**json.loads(told.readline()))
+
+        yield run
+
+
+def _serve() -> None:
+    """Run what each line of the standard input asks for, and write a result a line."""
+    with ready() as run:
+        for line in sys.stdin:
+            cases, seed = json.loads(line)
+            for result in run([(kind, number) for kind, number in cases], seed):
+                print(json.dumps(asdict(result)), flush=True)
 
 
 def _worker(cases: list[tuple[str, int]], seed: int, run: Run, out: Path) -> None:
@@ -380,8 +409,12 @@ def main() -> int:
     parser.add_argument("--kinds", default="", help="kinds of files, parted by commas; default: all")
     parser.add_argument("--case", type=int, help="run this case of one kind, and show what became of it")
     parser.add_argument("--keep", type=Path, default=ROW, help="JSON file of the counts")
+    parser.add_argument("--serve", action="store_true", help="run the cases that lines of the standard input name, as tests do")
     parser.add_argument("--failures", type=Path, help="file to which failures are added, a line each")
     arguments = parser.parse_args()
+    if arguments.serve:
+        _serve()
+        return 0
     targets = {name: TARGETS[name] for name in arguments.kinds.split(",")} if arguments.kinds else TARGETS
     if arguments.case is not None:
         with ready({arguments.kinds: TARGETS[arguments.kinds]}) as run:

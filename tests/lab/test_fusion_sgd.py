@@ -314,6 +314,7 @@ def test_flat_and_falling_histories():
     assert converged(history(noise)) and not converged(history(noise), 1e-6)
 
 
+@pytest.mark.long
 def test_good_predictions_are_selected_and_the_texture_found():
     """One affine map of the truth among patterns of noise, at a different k in every view."""
     problem, truth = planted(views=8, samples=5, spread=0.03)

@@ -743,6 +743,7 @@ def test_one_sided_surface_has_no_truth_behind(llvm, tmp_path, monkeypatch):
     assert on_card.any() and not reader.truth(view).valid[on_card].any()
 
 
+@pytest.mark.long
 def test_exposures_can_be_estimated(llvm, tmp_path, monkeypatch):
     reader = capture(tmp_path, monkeypatch, ROOM + TABLE, ", exposure: estimate")
     exposures = np.array([view.exposure for view in reader])

@@ -87,7 +87,13 @@ def test_the_tests_of_a_file_are_all_that_import_it_and_else_the_closest(checkou
     assert len(found["iif_core/fusion/passed.py"]) == 10 and "iif_core/fusion/alone.py" not in found
 
 
-@pytest.mark.parametrize("limits", [{"SOON": 1.0, "PATIENCE": 1.0}, {"SOON": 100.0, "IDLE": 0.01}], ids=["computes", "waits"])
+@pytest.mark.parametrize(
+    "limits",
+    [
+        pytest.param({"SOON": 1.0, "PATIENCE": 1.0}, id="computes"),
+        pytest.param({"SOON": 100.0, "IDLE": 0.01}, id="waits", marks=pytest.mark.long),
+    ],
+)
 def test_a_mutant_that_never_ends_is_killed(checkout, monkeypatch, limits):
     for name, value in limits.items():
         monkeypatch.setattr(mutants, name, value)

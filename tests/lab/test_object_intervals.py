@@ -45,6 +45,7 @@ def test_errors_of_the_model_are_found_again():
     assert found.albedo == pytest.approx(1.0, abs=0.2) and found.metallic == 1.0
 
 
+@pytest.mark.long
 def test_a_room_is_judged_by_the_others_alone():
     """The room of larger errors is not held by what others say, however many variants of it there are."""
     rooms = [room(seed, objects=80) for seed in range(5)]

@@ -44,6 +44,7 @@ def folder(tmp_path) -> Path:
     return own.path
 
 
+@pytest.mark.long
 def test_training_learns_what_there_is_to_learn(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "WARM_UP", 5)
     plan = training.Plan(folder, tmp_path / "out", steps=70, **(SMALL | {"rate": 1e-2}))

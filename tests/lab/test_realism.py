@@ -427,6 +427,7 @@ def test_linear_captures_have_no_scale(llvm, tmp_path):
     assert np.ptp(np.log(scale)) < 0.5 and not np.allclose(scale, 1, atol=0.02)
 
 
+@pytest.mark.long
 def test_a_mitsuba_scene_is_captured_as_it_is(llvm, tmp_path):
     from tests.lab.test_mitsuba_source import ROOM, TABLE, write
 

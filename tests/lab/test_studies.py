@@ -449,11 +449,12 @@ def test_unlisted_scenes(folder):
         files.load_study("a")
 
 
-def test_shipped_studies_load_at_every_quality(repository, monkeypatch):
+@pytest.mark.parametrize("quality", [q if q == "draft" else pytest.param(q, marks=pytest.mark.long) for q in settings.QUALITIES])
+def test_shipped_studies_load_at_every_quality(repository, monkeypatch, quality):
     monkeypatch.chdir(repository)
     for name in variants.study_names():
         study = files.load_study(name)
-        for quality, scene, variant in itertools.product(settings.QUALITIES, study.scenes, study.variants):
+        for scene, variant in itertools.product(study.scenes, study.variants):
             settings.load(derived.scene_of(name, scene, variant, study.seeds[0]), quality)
 
 

@@ -137,6 +137,7 @@ def test_everything_is_there_without_javascript(batch, opened):
     assert not page.locator(".filters").is_visible() and page.locator("thead button").count() == 0
 
 
+@pytest.mark.long
 def test_a_thousand_rows_are_light(tmp_path, opened):
     path = write(tmp_path, rows(1000))
     assert path.stat().st_size < 2e6

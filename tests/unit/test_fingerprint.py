@@ -75,6 +75,7 @@ def test_a_change_of_a_later_part_does_not_make_earlier_ones_anew(module, first)
     assert module in fp.stage_modules(first, document)
 
 
+@pytest.mark.long
 def test_touch_and_comments_change_nothing(checkout):
     code, run = checkout
     before = fingerprints(code, run)
@@ -83,6 +84,7 @@ def test_touch_and_comments_change_nothing(checkout):
     assert changed(before, fingerprints(code, run)) == set()
 
 
+@pytest.mark.long
 def test_setting_changes_stage_and_below(checkout):
     code, run = checkout
     before = fingerprints(code, run)

@@ -738,6 +738,7 @@ def test_stage_reads_back(scene):
     assert set(reader.names("photos/")) == {f"photos/{i:03d}.exr" for i in range(4)}
 
 
+@pytest.mark.long
 @pytest.mark.needs_scene
 def test_red_kitchen_passes_the_door(tmp_path, test_scene):
     """A real capture: photographs, poses and mesh agree with its depth images and not with a shifted picture."""

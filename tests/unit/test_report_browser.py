@@ -79,8 +79,7 @@ def report(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize(("viewport", "touch"), [(DESKTOP, False), (PHONE, True)])
+@pytest.mark.parametrize(("viewport", "touch", "scheme"), [(DESKTOP, False, "light"), (PHONE, True, "dark")])
 def test_accessible_quiet_and_within_the_screen(report, opened, scheme, viewport, touch):
     page = opened(report, viewport, touch, color_scheme=scheme)
     page.evaluate("for (const part of document.querySelectorAll('details')) part.open = true")

@@ -70,6 +70,7 @@ def test_results_do_not_depend_on_where_the_checkout_lies_and_how_it_is_named(re
     assert "Nothing to be done" in succeeded(moved.run("scenes/tiny", "-n"))
 
 
+@pytest.mark.long
 def test_a_checkout_may_have_a_space_in_its_path(repository, tmp_path):
     """Snakemake refuses the path of an image that has one, even where no image is used."""
     checkout = copy_of(repository, tmp_path / "a copy")

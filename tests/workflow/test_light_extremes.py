@@ -157,7 +157,7 @@ def test_hard_room(tmp_path, llvm):
     assert _fitted(found, room, "inside")[1].startswith(("population", "identity"))
 
 
-@pytest.mark.parametrize("pixels", ["all", 400])
+@pytest.mark.parametrize("pixels", ["all", pytest.param(400, marks=pytest.mark.long)])
 def test_views_that_are_held_out(tmp_path, llvm, pixels):
     """No light is cached for them, and every stage still runs."""
     build(tmp_path, truth=True, views=4, size=24, samples=16, held_out=(1,))
@@ -230,6 +230,7 @@ def test_environment_alone_through_a_hole(tmp_path, llvm):
     assert found.render.exr("maps/v000.exr")["R"].max() == pytest.approx(1, rel=0.05)  # the sky itself
 
 
+@pytest.mark.long
 def test_lamp_that_nobody_sees(tmp_path, llvm):
     """Above a baffle: only what it lights up says where it is, and how bright."""
     z = SIZE[2]

