@@ -147,7 +147,9 @@ def _write_plan(scene: str, quality: str) -> None:
     text = plan_text(scene, quality, [with_expectation(item, cost) for item in plan])
     write_atomically(Path("plan") / scene / "plan.yaml", lambda path: path.write_text(text))
     capture = StageReader(Path("results") / scene / "capture", "capture", scene)
-    counts = f"{capture.rows('cameras.parquet')} photographs, {capture.rows('faces.parquet')} faces"
+    tests = int((capture.table("cameras.parquet")["split"] == "test").sum())
+    kept = f", {tests} of them kept for testing" if tests else ""
+    counts = f"{capture.rows('cameras.parquet')} photographs{kept}; {capture.rows('faces.parquet')} faces"
     read = [counts, *capture.json("capture.json")["notes"]]
     for title, lines in (("what was read", read), (f"what {scene} requires", plan_sentences(plan))):
         print("\n".join([f"{title}:", *(f"  {line}" for line in lines)]))

@@ -84,7 +84,9 @@ def test_paths_without_extension_globs_and_spread(tmp_path):
     for entry in document["frames"]:
         entry["file_path"] = "./" + entry["file_path"].removesuffix(".png")
     own.write_transforms(tmp_path, document)
-    assert [f.name for f in read(tmp_path, capture={"views": 4}).frames] == ["001", "003", "005", "007"]
+    found = read(tmp_path, capture={"views": 4})
+    assert [f.name for f in found.frames] == ["001", "003", "005", "007"] and not read(tmp_path).notes
+    named(found.notes[0], "4 of the 8 photographs", "`capture.views: 4`")
     assert [f.name for f in read(tmp_path, {"frames": "images/00[0-2]"}).frames] == ["000", "001", "002"]
     assert evenly_spread(3, 5) == [0, 1, 2] and evenly_spread(100, 1) == [50]
     got = folder.raw_inputs(own.settings_of(tmp_path, capture={"views": 4}))

@@ -183,7 +183,7 @@ def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[s
     names = {image.name for image in model.images}
     there = files_below(root, EXTENSIONS)
     without = [path.name for path in there if path.relative_to(root).as_posix() not in names]
-    notes = []
+    notes = [*listed.notes]
     if without:
         notes.append(f"{len(without)} of {len(there)} images have no pose in {model.path} and are not used, such as {without[0]}")
     return replace(listed, axes="opencv", known=True, notes=tuple(notes), also=model.files)

@@ -74,6 +74,15 @@ def choose_entries(entries: list[Entry], views: int) -> list[Entry]:
     return [e for e in entries if id(e) in taken]
 
 
+def notes_of_choice(taken: int, listed: int, pattern: str | None, views: int) -> tuple[str, ...]:
+    """Say how many of the photographs that the camera file lists are used, if not all: `source.frames` and `capture.views`."""
+    if taken == listed:
+        return ()
+    matching = f", of those that match `source.frames: {pattern}`" if pattern is not None else ""
+    spread = f", evenly spread (`capture.views: {views}` is the most)" if taken == views else ""
+    return (f"{taken} of the {listed} photographs in the list of cameras are used{matching}{spread}",)
+
+
 def locate(
     path: Path, entries: list[Entry], root: Path, pattern: str | None, capture: dict[str, Any]
 ) -> list[tuple[Entry, Path]]:

@@ -29,7 +29,7 @@ from workflow.sources.folder_scene.camera import (
     refuse_swapped,
     size_of,
 )
-from workflow.sources.folder_scene.entries import Entry, locate, some
+from workflow.sources.folder_scene.entries import Entry, locate, notes_of_choice, some
 
 SAME_SHAPE = 0.03
 """Difference of the ratio of sides by which a depth image is still one of the same camera."""
@@ -94,7 +94,7 @@ class Cameras:
         depth_unit: metres per value of the depth images, where the file states it.
         axes: camera axes of the frames' matrices, `opengl` or `opencv`.
         known: whether the format of the file determines the axes, so that no setting can be wrong.
-        notes: what was left out, as text.
+        notes: which photographs were chosen, and what was left out, as text.
         also: further files that were read.
     """
 
@@ -180,7 +180,8 @@ def checked_frames(
     frames = [replace(frame, colour=source.get("colour", "file")) for frame in frames]
     if world is not None:
         frames = [replace(f, matrix=_in_world(world, f.matrix)) for f in frames]
-    return Cameras(path, tuple(frames), _depth_unit(path, document), source.get("axes", "opengl"))
+    said = notes_of_choice(len(frames), len(entries), source.get("frames"), capture["views"])
+    return Cameras(path, tuple(frames), _depth_unit(path, document), source.get("axes", "opengl"), notes=said)
 
 
 def _frame(
