@@ -95,6 +95,10 @@ def parse_json(path: Path, text: str | bytes) -> Any:
         return json.loads(text, object_pairs_hook=_once, parse_int=_integer)
     except (ValueError, RecursionError) as error:
         said = "nested too deeply" if isinstance(error, RecursionError) else shorter(error)
+        if isinstance(error, json.JSONDecodeError) and error.pos >= len(text.rstrip()):
+            said = f"it ends in the middle, after {len(text)} characters; copy or export the whole file again"
+        elif isinstance(error, json.JSONDecodeError) and error.msg.startswith("Unterminated"):
+            said += "; a quotation mark is missing, or the file was cut short"
         raise InputError(f"{path}: not valid JSON ({said})") from None
 
 
