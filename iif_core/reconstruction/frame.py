@@ -1,4 +1,4 @@
-"""The frame of a room that photographs alone do not tell: which way is up, where the floor lies, and how long a metre is."""
+"""The frame of a room: which way is up, and, for photographs alone, where the floor lies and how long a metre is."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from iif_core.camera.pinhole import up_axis
 from iif_core.surface.enclosure import directions, fitted_plane
 from iif_core.surface.triangles import face_geometry
 
@@ -23,6 +24,12 @@ NOISE = 0.005
 """Share of the level surface below the floor, and above the ceiling: depth that is wrong."""
 LEAST = 0.005
 """Least share of the area that makes a floor or a ceiling."""
+LEANS = float(np.radians(2.0))
+"""Angle between the vertical and an axis up to which the axis is the vertical: floors of scans are off by up to 0.8 degrees."""
+NEAR = float(np.radians(5.0))
+"""Largest angle with the vertical at which a face counts as level beside another vertical."""
+CLEARLY, LEAST_LEVEL = 2.0, 0.02
+"""How many times as much surface must be level by another vertical than by an axis, and which share of all surface."""
 BINS = 90
 """Layers in which the height of the room is divided."""
 
@@ -55,18 +62,8 @@ def room_frame(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLi
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
     normal, area = face_geometry(vertices, faces)
-    up = upright(world_from_camera)
-    found = directions(normal, area)
-    level = found[np.abs(found @ up) >= UPRIGHT]
-    if len(level):  # the largest
-        up = level[0] * np.sign(level[0] @ up)
-    middle = vertices[faces].mean(1)
-
-    # -------- the floor tells the vertical best --------
-    level = np.abs(normal @ up) > LEVEL
-    beside = BESIDE_FLOOR * float(np.ptp(middle @ up))
-    floor = _ends(middle @ up, area, level)[0]
-    up, _ = fitted_plane(up, level & (np.abs(middle @ up - floor) <= beside), middle, normal, area, beside)
+    middle, found = vertices[faces].mean(1), directions(normal, area)
+    up = _vertical(middle, normal, area, found, world_from_camera)
 
     # -------- walls: the largest direction that is square to it --------
     across = found[np.abs(found @ up) < np.sqrt(1 - UPRIGHT**2)]
@@ -74,6 +71,47 @@ def room_frame(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLi
     along = along - (along @ up) * up
     along /= np.linalg.norm(along)
     return RoomFrame(np.stack([along, np.cross(up, along), up]), *_ends(middle @ up, area, np.abs(normal @ up) > LEVEL))
+
+
+def upward(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLike) -> NDArray:
+    """Return what is up (3,) in a capture whose coordinates may lean, as those of COLMAP and of depth cameras do: the axis
+    nearest to the vertical of the cameras, unless the surface says otherwise.
+
+    It does if its vertical (as in `room_frame`) is more than `LEANS` away from that axis, and `CLEARLY` as much surface is level
+    by it as by the axis; level is what is nearer to the one than to the other.
+
+    Args:
+        vertices, faces: (n, 3) and (m, 3), in any unit.
+        world_from_camera: (v, 3 or 4, 4) poses, OpenCV axes.
+    """
+    axis = up_axis(world_from_camera)
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+    normal, area = face_geometry(vertices, faces)
+    up = _vertical(vertices[faces].mean(1), normal, area, directions(normal, area), world_from_camera)
+    angle = float(np.arccos(np.clip(axis @ up, -1.0, 1.0)))
+    if angle <= LEANS:
+        return axis
+    by_up, by_axis = (float(area[np.abs(normal @ one) >= np.cos(min(angle / 2, NEAR))].sum()) for one in (up, axis))
+    return up if by_up >= max(CLEARLY * by_axis, LEAST_LEVEL * float(area.sum())) else axis
+
+
+def _vertical(middle: NDArray, normal: NDArray, area: NDArray, found: NDArray, world_from_camera: ArrayLike) -> NDArray:
+    """Return the direction (3,) that most surface faces of those near the vertical of the cameras; without one, the cameras' own.
+
+    Args:
+        middle, normal, area: (m, 3), (m, 3) and (m,) of the faces.
+        found: (k, 3) directions of surface, the largest first.
+    """
+    up = upright(world_from_camera)
+    level = found[np.abs(found @ up) >= UPRIGHT]
+    if len(level):  # the largest
+        up = level[0] * np.sign(level[0] @ up)
+    # The floor tells the vertical best.
+    is_level = np.abs(normal @ up) > LEVEL
+    beside = BESIDE_FLOOR * float(np.ptp(middle @ up))
+    floor = _ends(middle @ up, area, is_level)[0]
+    up, _ = fitted_plane(up, is_level & (np.abs(middle @ up - floor) <= beside), middle, normal, area, beside)
+    return up
 
 
 def upright(world_from_camera: ArrayLike) -> NDArray:

@@ -610,6 +610,28 @@ def test_a_convention_that_puts_all_cameras_at_one_point_is_not_proposed(monkeyp
     assert "mesh_up" in alignment.explain_edges(trials, trace, now, True, 0.01, 1000.0)  # cameras on a wide ground may turn
 
 
+def test_a_capture_that_leans_in_its_coordinates_stands_upright_in_exports(tmp_path):
+    """Photographs, cameras and mesh as before, all turned by 27 degrees about a slanted axis."""
+    from workflow.exporters.glb import rotation_to_y
+
+    path = own.project(tmp_path, {"registration": "off"})
+    document, _ = own.photographed(path, 4)
+    plain = own.run(tmp_path, "capture")
+    assert "up" not in plain.facts and not any("leans" in note for note in plain.facts["notes"])
+    turn = Rotation.from_rotvec(np.radians(27.0) * np.array([0.8, 0.6, 0.0]))
+    moved = np.eye(4)
+    moved[:3, :3] = turn.as_matrix()
+    for entry in document["frames"]:
+        entry["transform_matrix"] = (moved @ np.array(entry["transform_matrix"])).tolist()
+    own.write_transforms(path, document)
+    vertices, faces, _ = own.room_mesh()
+    own.save_mesh(path / "mesh.ply", turn.apply(vertices), faces)
+    capture = own.run(tmp_path, "capture")
+    np.testing.assert_allclose(capture.up, turn.apply(plain.up), atol=5e-3)
+    assert any("leans by 27 degrees" in note for note in capture.facts["notes"])
+    np.testing.assert_allclose(Rotation.from_quat(rotation_to_y(capture.up)).apply(capture.up), [0, 1, 0], atol=1e-9)
+
+
 @pytest.mark.parametrize("mesh_up", ["z x", "x x y", "y x z", "x y w", ""])
 def test_what_is_no_turn_of_the_mesh_is_refused(mesh_up):
     with misset("mesh_up", "value_error", "as_poses"):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from iif_core.reconstruction.agreement import agreed, votes
 from iif_core.reconstruction.flat import flat_depth, textured
-from iif_core.reconstruction.frame import room_frame, upright
+from iif_core.reconstruction.frame import room_frame, upright, upward
 from iif_core.reconstruction.fusing import fused_mesh, large_pieces
 from iif_core.reconstruction.neighbours import neighbours
 from iif_core.reconstruction.sweep import Picture, SweepOptions, _add_path, swept_depth
@@ -425,6 +425,31 @@ def test_the_vertical_of_cameras_that_look_down():
     assert upright(poses)[2] > 0.9999
     same = np.repeat(poses[1:2], 3, 0)  # one direction tells no more than its picture
     np.testing.assert_allclose(upright(same), -same[0, :3, 1])
+
+
+def _eyes():
+    eyes = [(-1.0, 0.5, 0.2), (1.0, -0.5, 0.3), (0.3, 1.0, 0.1)]
+    return np.array([np.linalg.inv(np.vstack([looking(eye, (0.2, 0.1, -0.5)), [0, 0, 0, 1]])) for eye in eyes])
+
+
+@pytest.mark.parametrize("angle", [3.0, 12.0, 40.0])
+def test_what_is_up_in_a_room_that_leans(angle):
+    vertices, faces = room(((1, 1),))
+    moved = np.eye(4)
+    moved[:3, :3] = Rotation.from_rotvec(np.radians(angle) * np.array([0.6, -0.8, 0.0])).as_matrix()
+    up = upward(vertices @ moved[:3, :3].T, faces, moved @ _eyes())
+    assert np.degrees(np.arccos(min(up @ moved[:3, 2], 1.0))) < 0.2
+
+
+def test_an_axis_is_up_unless_the_floor_says_otherwise():
+    """Exactly so, with noise and a roof that slopes: it is larger than the floor, which is level all the same."""
+    vertices, faces = room(((1, 1),))
+    noisy = vertices + np.random.default_rng(0).normal(0, 0.01, vertices.shape)
+    np.testing.assert_array_equal(upward(noisy, faces, _eyes()), [0, 0, 1])
+    roof = np.array([[-4.0, -3, 1.3], [4, -3, 1.3], [4, 3, 3.4], [-4, 3, 3.4]])  # 15 degrees
+    every = np.concatenate([faces, np.array([[0, 2, 1], [0, 3, 2]]) + len(vertices)])
+    assert room_frame(np.concatenate([vertices, roof]), every, _eyes()).turn[2, 2] < 0.98  # the roof is taken for level
+    np.testing.assert_array_equal(upward(np.concatenate([vertices, roof]), every, _eyes()), [0, 0, 1])
 
 
 @pytest.mark.parametrize("seed", range(3))

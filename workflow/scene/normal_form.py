@@ -192,7 +192,7 @@ class CaptureReader:
 
     @property
     def up(self) -> np.ndarray:
-        """(3,) direction that is up in the world: as the source says, or else the axis nearest to that of the cameras."""
+        """(3,) direction that is up in the world: as capture.json says, or else the axis nearest to that of the cameras."""
         return np.asarray(self.facts.get("up") or up_axis([view.world_from_camera for view in self.views]), np.float64)
 
     def __iter__(self) -> Iterator[View]:

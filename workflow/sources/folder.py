@@ -16,7 +16,9 @@ import numpy as np
 
 from iif_core.camera.alignment import Photo
 from iif_core.camera.exposure import ExposureGains
+from iif_core.camera.pinhole import up_axis
 from iif_core.errors import InputError
+from iif_core.reconstruction.frame import upward
 from workflow.decisions import camera as camera_decisions
 from workflow.decisions.record import Decision
 from workflow.intake.documents import reading
@@ -346,6 +348,7 @@ def _write(
         "origin": origin.tolist(),
         "exposure_estimated": estimated,
         "stated_exposure": _stated(task, posed.frames),
+        **_upward(surface, views, said),
         **({"held_out": held} if held else {}),
         **({"added_faces": added} if added else {}),
     }
@@ -353,6 +356,21 @@ def _write(
     writer.finish(task.source.kind, task.settings.dynamic_range, has_truth, said, task.inputs.response, facts)
     for note in said:
         job.log.info("%s", note)
+
+
+def _upward(surface: mesh.Mesh, views: list[View], said: list[str]) -> dict[str, list[float]]:
+    """Return `up`, an entry of capture.json, where the capture leans in its coordinates, and say so. Else the reader takes the
+    axis nearest to the cameras' (`CaptureReader.up`)."""
+    poses = np.stack([view.world_from_camera for view in views])
+    up, axis = upward(surface.vertices, surface.faces, poses), up_axis(poses)
+    if (up == axis).all():
+        return {}
+    angle = np.degrees(np.arccos(np.clip(up @ axis, -1.0, 1.0)))
+    shown = ", ".join(f"{value:.3f}" for value in up)
+    said.append(
+        f"the room leans by {angle:.0f} degrees in its coordinates: up is ({shown}), by its level surface; exports stand upright"
+    )
+    return {"up": up.tolist()}
 
 
 def _stated(task: _Task, frames: Sequence[Frame]) -> dict[str, float]:
