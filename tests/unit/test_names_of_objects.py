@@ -61,7 +61,10 @@ def test_one_name_for_several_objects_means_all_of_them():
     relight = [{"name": "a", "materials": {"oak table": {"metallic": 1}}}]
     document = tree(names=names, materials={"oak table": {"roughness": 0.4}}, relight=relight)
     assert list(document["materials"]) == list(document["relight"][0]["materials"]) == ["yellow top 1", "7"]
-    assert sheet.described(document["relight"][0], {str(key): name for key, name in names.items()}) == "oak table painted"
+    assert (
+        sheet.described(document["relight"][0], Inventory([], []), {str(key): name for key, name in names.items()})
+        == "oak table painted"
+    )
     with misset("", "value_error", "'oak table'"):
         tree(names=names, affines={"scale": {"white_patch": {"object": "oak table", "albedo": 0.8}}})
     room = Inventory(["a", "b", "c"], [Lamp(0, (0,)), Lamp(1, (2,))], ["lamps", "b", "lamps"])

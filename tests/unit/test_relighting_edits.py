@@ -559,9 +559,9 @@ def test_lamps_are_called_by_object_or_id(things):
     assert things.lamps_called("window", "x") == [0] and things.lamps_called("4", "x") == [1]
     assert things.lamps_called("bulb", "x") == [1, 2]
     for key, names in (
-        ("windw", ["'windw'", "'window'", "0 (window), 4 (bulb)"]),
-        ("7", ["'7'", "0 (window), 4 (bulb)"]),
-        ("wall", ["object 'wall'", "0 (window), 4 (bulb)"]),
+        ("windw", ["'windw'", "'window'", "window (emitter 0), bulb (emitter 4, 5)"]),
+        ("7", ["'7'", "window (emitter 0), bulb (emitter 4, 5)"]),
+        ("wall", ["object 'wall'", "window (emitter 0), bulb (emitter 4, 5)"]),
     ):
         with refused("relight.lamps", "a", *names):
             things.check(entry(lamps={key: "off"}))
@@ -736,19 +736,31 @@ def test_flights_have_a_video_and_the_sheet_shows_what_was_before(toy):
 
 
 def test_captions_say_what_changes():
+    lamps = [Lamp(0, (1,), 1.0, "window 1"), Lamp(1, (1,), 1.0, "ceiling light 1"), Lamp(2, (2,), 1.0, "ceiling light 1")]
+    room = Inventory(["wall", "pane", "panel"], [*lamps, Lamp(3, (0,), 1.0, "lamp 1")])
     told = sheet.described(
         entry(
             emitters=0.5,
-            lamps={"bulb": "off", 3: {"colour": [1, 0, 0], "factor": 2}, "x": {"move": [0, 0, 1]}},
+            lamps={"pane": "off", 2: {"colour": [1, 0, 0], "factor": 2}, "lamp 1": {"move": [0, 0, 1]}},
             environment=[1, 1, 1],
             insert=[{"file": "a/vase.glb", "position": [0, 0, 0]}],
             materials={"wall": {"metallic": 0}},
-        )
+        ),
+        room,
     )
-    lamps, rest = told.split("; light from ")
-    assert lamps == "other lamps x 0.5; bulb off; lamp 3 x 2, colour 1 0 0; x moved 0 0 1 m"
+    of_lamps, rest = told.split("; light from ")
+    assert of_lamps.split("; ") == [
+        "other lamps x 0.5",
+        "window 1 off",  # on the pane is one of the ceiling lights too
+        "ceiling light 1 (emitter 1) off",
+        "ceiling light 1 (emitter 2) x 2, colour 1 0 0",
+        "lamp 1 moved 0 0 1 m",
+    ]
     assert rest == "outside 1 1 1; vase put in; wall painted"
-    assert sheet.described(entry()) == "as found"
+    assert sheet.described(entry(), room) == "as found"
+    alone = sheet.described(next(iter(room.expanded([entry(each="alone")]))), room)
+    assert alone == "other lamps off; ceiling light 1 on; light from outside off"  # both, which are the strongest
+    assert sheet.described(entry(emitters=0.3), Inventory(["wall"], [])) == "all lamps x 0.3 (there are none)"
 
 
 # ----------------------------------------------------------------------------------------------------------------- plans

@@ -96,8 +96,11 @@ class Inventory:
         found = placed or on_object or [i for i, lamp in enumerate(self.lamps) if key == str(lamp.emitter_id)]
         if found:
             return found
-        each = dict.fromkeys(lamp.name or f"{lamp.emitter_id} ({self.name_of(lamp)})" for lamp in self.lamps)
-        there = f"{', '.join(list(each)[:8])}; the report lists them" if each else "none"
+        each: dict[str, list[str]] = {}
+        for lamp in self.lamps:
+            each.setdefault(lamp.name or self.name_of(lamp), []).append(str(lamp.emitter_id))
+        listed = [f"{name} (emitter {', '.join(ids)})" for name, ids in each.items()]
+        there = f"{', '.join(listed[:8])}; the report lists them" if each else "none"
         if key == OUTSIDE:
             raise InputError(f"{where}: {key!r} is no lamp; `environment` switches and dims it: `environment: off`")
         known = [(self.shown or self.names)[o] for lamp in self.lamps for o in lamp.objects]
@@ -105,6 +108,22 @@ class Inventory:
         is_there = any(self.is_called(o, key) for o in range(len(self.names)))
         what = f"object {key!r} does not shine" if is_there else f"there is no lamp {key!r}"
         raise InputError(f"{where}: {what}.{hint} Lamps of this room: {there}")
+
+    def captions(self, changes: Mapping[str, str]) -> list[str]:
+        """Return what happens to which lamps as people call them: by name where all of that name change alike (`window 1 off`),
+        else with the emitters that do (`ceiling light 1 (emitter 2) off`); `changes`: key of the settings -> what changes."""
+        members: dict[str, list[Lamp]] = {}
+        for lamp in self.lamps:
+            members.setdefault(lamp.name or self.name_of(lamp), []).append(lamp)
+        told: dict[tuple[str, str], list[int]] = {}
+        for key, change in changes.items():
+            for lamp in (self.lamps[i] for i in self.lamps_called(key, "relight.lamps")):
+                told.setdefault((lamp.name or self.name_of(lamp), change), []).append(lamp.emitter_id)
+        out = []
+        for (name, change), some in told.items():
+            ids = ", ".join(f"emitter {one}" for one in sorted(some))
+            out.append(f"{name}{'' if len(some) == len(members[name]) else f' ({ids})'} {change}")
+        return out
 
     def expanded(self, entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
         """Return dumped relightings, those with `each` as one for each of the strongest lamps, the strongest first."""

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from workflow.relighting.inventory import Inventory
 from workflow.settings.relight import name_of
 
 Array = np.ndarray
@@ -120,16 +121,18 @@ def _wrapped(text: str, font: Any, width: int, ruler: Any) -> list[str]:
     return lines
 
 
-def described(entry: dict[str, Any], names: Mapping[str, str] | None = None) -> str:
+def described(entry: dict[str, Any], inventory: Inventory, names: Mapping[str, str] | None = None) -> str:
     """Describe what a dumped relighting changes, for captions; `names`: the setting."""
-    parts = []
+    parts, changes = [], {}
     if entry["emitters"] != 1:
-        parts.append(f"{'all' if not entry['lamps'] else 'other'} lamps {_factor(entry['emitters'])}")
+        none = "" if inventory.lamps else " (there are none)"
+        parts.append(f"{'all' if not entry['lamps'] else 'other'} lamps {_factor(entry['emitters'])}{none}")
     for key, lamp in entry["lamps"].items():
         told = [_factor(lamp["factor"])] if lamp["factor"] != 1 or not (lamp["colour"] or lamp["move"]) else []
         told += [f"colour {_numbers(lamp['colour'])}"] if lamp["colour"] else []
         told += [f"moved {_numbers(lamp['move'])} m"] if lamp["move"] else []
-        parts.append(f"{key if not key.isdigit() else f'lamp {key}'} {', '.join(told)}")
+        changes[key] = ", ".join(told)
+    parts += inventory.captions(changes)
     light = entry["environment"]
     if light != "keep":
         is_file = isinstance(light, str) and light != "off"

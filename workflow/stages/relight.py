@@ -63,7 +63,7 @@ def _relight(one: Frames, curve: Response) -> tuple[dict[str, Any], sheet.Row]:
     before = {frame: one.picture_before(frame) for frame in shown}
     taken = photograph_exposure(one.studio.capture, read_gains(job), view)
     display = display_of(entry, curve, taken, view.name, before[shown[0]], lambda: one.picture(0))
-    changes, pairs, is_dark = sheet.described(entry, new_names(job)), [], True
+    changes, pairs, is_dark = sheet.described(entry, one.studio.inventory, new_names(job)), [], True
 
     def pictures() -> Iterator[Array]:
         nonlocal is_dark
