@@ -13,7 +13,7 @@ from workflow.decisions import materials
 from workflow.report import calibration, wording
 from workflow.report.emitters import lamp_power
 from workflow.report.evidence import BRIGHT, SHOWN, doubtful_area
-from workflow.report.verdict import AMBER, GREEN, LIGHT_OF, LIMITS, MEANS, ORDER, RED, Evidence, judge, limits_table
+from workflow.report.verdict import AMBER, GREEN, LIGHT_OF, LIMITS, MEANS, NOTED, ORDER, RED, Evidence, judge, limits_table
 
 GOOD = Evidence(
     escape=0.0, escape_camera=0.0, depth=0.004, edges=0.45, agreement=0.92, photographs=24, photographed=0.95, stability=0.9,
@@ -176,6 +176,13 @@ def test_gloss_is_judged_by_the_truth_alone():
     said = [finding.text for finding in judge(dataclasses.replace(GOOD, **without, roughness_interval=0.31)).lights[2].findings]
     assert any("0.31" in text for text in said)
     assert "none of them compares" in judge(dataclasses.replace(GOOD, **without, roughness_interval=0.05)).sentence
+    # What was not judged did not pass.
+    light = judge(dataclasses.replace(GOOD, **without, roughness_interval=None)).lights[2]
+    noted = [finding for finding in light.findings if finding.level == NOTED]
+    assert len(noted) == 2 and list(light.rest[-2:]) == noted  # gloss, and that there is no truth
+    assert light.rest_words == f"{len(light.rest) - 2} more checks passed, 2 not judged"
+    said = judge(dataclasses.replace(GOOD, **without)).document()["lights"]["materials"]["findings"]
+    assert [one["verdict"] for one in said][-2:] == ["not judged"] * 2
 
 
 NUMBERS = {name: st.one_of(st.none(), st.floats(0, 40)) for name in ("misfit", "doubtful_area", "held_out", "used", "escape")}

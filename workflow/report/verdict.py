@@ -16,12 +16,12 @@ from workflow.decisions import held
 from workflow.report import calibration
 from workflow.report.wording import percent
 
-GREEN, AMBER, RED = "green", "amber", "red"
-ORDER = (GREEN, AMBER, RED)
+NOTED, GREEN, AMBER, RED = "noted", "green", "amber", "red"
+ORDER = (NOTED, GREEN, AMBER, RED)
 NAMED = 3
 """Doubtful lamps that a finding names."""
-WORDS = {GREEN: "good", AMBER: "doubtful", RED: "poor"}
-"""A light in a word, so that no colour is needed to read it."""
+WORDS = {NOTED: "not judged", GREEN: "good", AMBER: "doubtful", RED: "poor"}
+"""A light, or one of its findings, in a word, so that no colour is needed to read it. No light is `NOTED`."""
 
 
 class Limit(NamedTuple):
@@ -204,7 +204,7 @@ class Light:
 
     @property
     def level(self) -> str:
-        return self.findings[0].level if self.findings else GREEN
+        return max([GREEN, *(f.level for f in self.findings)], key=ORDER.index)
 
     @property
     def word(self) -> str:
@@ -218,11 +218,18 @@ class Light:
     @property
     def shown(self) -> Sequence[Finding]:
         """What is not green, or else the first two findings."""
-        return [f for f in self.findings if f.level != GREEN] or self.findings[:2]
+        return [f for f in self.findings if f.level in (AMBER, RED)] or self.findings[:2]
 
     @property
     def rest(self) -> Sequence[Finding]:
         return [f for f in self.findings if f not in self.shown]
+
+    @property
+    def rest_words(self) -> str:
+        """How many of the rest passed, and how many say what nothing was judged by."""
+        passed, noted = (sum((f.level == NOTED) == is_noted for f in self.rest) for is_noted in (False, True))
+        told = [f"{_counted(passed, 'more check')} passed"] if passed else []
+        return ", ".join([*told, *([f"{noted} not judged"] if noted else [])])
 
 
 @dataclass(frozen=True)
@@ -498,7 +505,7 @@ def _materials(e: Evidence) -> Light:
             "Hold some out: capture: {test_every: 8}",
         )  # fmt: skip
     elif not e.has_truth:
-        judged = Finding(GREEN, f"No ground truth: {_counted(e.held_out_views, 'held-out photograph')} stand in for it")
+        judged = Finding(NOTED, f"No ground truth: {_counted(e.held_out_views, 'held-out photograph')} stand in for it")
     weak = None
     if e.prior == "retinex":
         weak = Finding(
@@ -550,10 +557,10 @@ def _gloss(e: Evidence) -> list[Finding | None]:
             ),
         ]  # fmt: skip
     if e.roughness_interval is None:
-        return [Finding(GREEN, "Not judged: photographs show the roughness of less than 50 % of the surface")]
+        return [Finding(NOTED, "Not judged: photographs show the roughness of less than 50 % of the surface")]
     known = f"Not judged: roughness is known to within ±{e.roughness_interval:.2f}"
     rooms = f"in {held.rooms()} rendered rooms, 95 % intervals of roughness held for {held.words('roughness')} of the objects"
-    return [Finding(GREEN, f"{known}; {rooms} that have one")]
+    return [Finding(NOTED, f"{known}; {rooms} that have one")]
 
 
 def _off(psnr: float) -> float:
