@@ -390,11 +390,14 @@ def test_nothing_is_written(project):
 # ---------------------------------------------------------------------------------------------------------- which, and how
 
 
-def test_which_scenes_are_shown(project):
+def test_which_scenes_are_shown(project, capsys):
     for name in ("a", "b", "studies"):
         Path(f"results/{name}/logs").mkdir(parents=True)
     assert status.scenes_to_show() == ["a", "b"]
     Path("config/batch.tsv").write_text("name\tbase\nx\ta\ny\ta\n")
+    assert status.scenes_to_show() == ["a"]  # nobody uses the table yet
+    assert status.tell([], lambda _: "draft") == 0 and "never begun: x, y" in capsys.readouterr().out
+    Path("results/x/logs").mkdir(parents=True)
     assert status.scenes_to_show() == ["x", "y", "a"]  # it has settings and results, and is no line of the table
     JobState("b", "base", "mark").started()  # asked for by name, in addition to the batch
     JobState("a--fast", "base", "mark").failed("no light")
@@ -421,7 +424,7 @@ def test_lines_fit_the_terminal_and_hold_nothing_that_steers_it():
         ),
     ]
     first, running, failed, last = status.text(rows, now, 100)
-    assert first.split() == ["scene", "state", "stage", "for", "CPU", "memory"]
+    assert first.split() == ["scene", "state", "stage", "time", "CPU", "memory"]
     assert running.split("  ") == ["kitchen", "running", "base +1", "42 s of about 1 min", "1 min 40 s", "1.2 GB"]
     assert len(failed) == 100 and failed.endswith("x...") and "3 days" in failed and "\x1b" not in failed and "no light" in failed
     assert last == "2 scenes: 1 running, 1 failed; 1 min 40 s of CPU time so far, about 50 s to go; at quality draft"

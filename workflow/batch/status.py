@@ -27,7 +27,8 @@ GAP = "  "
 
 def scenes_to_show(named: Sequence[str] = ()) -> list[str]:
     """Return which scenes are shown: those that are named; or those of the batch table, others of which jobs run, and those that
-    have settings and a folder in results/; or, without a table, everything that has a file or a folder in results/.
+    have settings and a folder in results/; or, without a table, everything that has a file or a folder in results/. A table of
+    which no scene has begun is not in use where others have: its scenes are not shown then.
 
     Raises:
         InputError: the table cannot be read.
@@ -40,8 +41,14 @@ def scenes_to_show(named: Sequence[str] = ()) -> list[str]:
     if any(line.number for line in lines):
         known = set(scene_names())
         running = standing.with_running_jobs({*of_table, *known})
-        return list(dict.fromkeys([*of_table, *running, *(name for name in folders if name in known)]))
+        begun = dict.fromkeys([*running, *(name for name in folders if name in known)])
+        in_use = not begun or any(name in begun or name in folders or Path("scenes", name).exists() for name in of_table)
+        return list(dict.fromkeys([*(of_table if in_use else ()), *begun]))
     return list(dict.fromkeys([*of_table, *(name for name in folders if name not in RESERVED)]))
+
+
+def _of_table() -> list[str]:
+    return [line.name for line in batch_table.read_table()]
 
 
 def tell(named: Sequence[str], quality_of: Callable[[str], str], as_json: bool = False) -> int:
@@ -62,9 +69,9 @@ def tell(named: Sequence[str], quality_of: Callable[[str], str], as_json: bool =
     found = list(standing.survey(scenes, quality_of))
     width = shutil.get_terminal_size((UNBOUNDED, 24)).columns  # or those that `COLUMNS` says, as `watch` does
     lines = [json_line(one, now) for one in found] if as_json else text(found, now, width)
-    others = [] if named or as_json else sorted(set(scene_names()) - set(scenes))
+    others = [] if named or as_json or code else sorted({*scene_names(), *_of_table()} - set(scenes))
     if others:
-        lines.append(f"also in config/scenes, never begun: {', '.join(others)}")
+        lines.append(f"never begun: {', '.join(others)}")
     try:
         print("\n".join(lines), flush=True)
     except BrokenPipeError:  # `| head` has seen enough
@@ -89,7 +96,7 @@ def text(found: Sequence[Standing], now: float, width: int) -> list[str]:
     """Return the lines of the table, cut to the `width` of the terminal in columns; `now` as `time.time`."""
     if not found:
         return ["no scenes: neither config/scenes nor results holds any"]
-    rows = [("scene", "state", "stage", "for", "CPU", "memory", "")]
+    rows = [("scene", "state", "stage", "time", "CPU", "memory", "")]
     for one in found:
         stage = f"{one.stage} +{len(one.running) - 1}" if len(one.running) > 1 else one.stage
         cpu = duration(one.cpu_seconds) if one.cpu_seconds else ""
@@ -109,7 +116,9 @@ def _age(one: Standing, now: float) -> str:
         return ""
     seconds = max(0.0, now - one.since)
     spent = duration(seconds) if seconds < 48 * 3600 else f"{seconds / 86400:.0f} days"
-    return f"{spent} of about {duration(one.expected_seconds)}" if one.expected_seconds is not None else spent
+    if one.expected_seconds is not None:
+        return f"{spent} of about {duration(one.expected_seconds)}"
+    return spent if one.state == "running" else f"{spent} ago"
 
 
 def total(found: Sequence[Standing]) -> str:
@@ -120,7 +129,7 @@ def total(found: Sequence[Standing]) -> str:
     spent = sum(one.cpu_seconds for one in found)
     left = sum(one.remaining_cpu_seconds or 0.0 for one in found if one.state != "failed")  # those wait for a person
     so_far = f"{duration(spent)} of CPU time so far" if spent else "nothing done so far"
-    to_go = f", about {duration(left)} to go" if left else ""
+    to_go = f", about {duration(left)} to go{'' if any(one.running for one in found) else ', once started'}" if left else ""
     name = "scene" if len(found) == 1 else "scenes"
     qualities = list(dict.fromkeys(one.quality for one in found if one.quality))
     looked_at = f"; at quality {', '.join(qualities)}" if qualities else ""
