@@ -11,6 +11,7 @@ import subprocess
 import sys
 import zipfile
 from email import message_from_string
+from pathlib import Path
 
 import pytest
 from packaging.specifiers import SpecifierSet
@@ -279,6 +280,21 @@ def test_doctor_passes_here(repository, clean_environment):
         "kernel cache",
     ):
         assert any(line[6:].startswith(f"{what}: ") for line in lines), what
+
+
+def test_doctor_asks_for_nothing_that_the_installation_brings(repository, tmp_path, clean_environment):
+    """A fresh clone: the machine is judged, and what is missing comes by itself."""
+    shutil.copytree(repository / "workflow", tmp_path / "workflow", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("iif_core", "envs"):
+        shutil.copytree(repository / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    base = Path(sys.base_prefix) / "bin" / f"python{sys.version_info.major}.{sys.version_info.minor}"
+    result = run([str(base), "-S", "-m", "workflow.runtime.doctor"], tmp_path, clean_environment)
+    assert result.returncode == 0, result.stdout + result.stderr
+    told = {line[6:].partition(":")[0]: line for line in result.stdout.splitlines()}
+    assert "FAIL" not in result.stdout and {"python", "packages", "disk", "cores"} <= set(told) and "llvm" not in told
+    assert "make scenes/kitchen" in told["packages"]
+    (tmp_path / ".venv").mkdir()  # somebody began to install
+    assert run([str(base), "-S", "-m", "workflow.runtime.doctor"], tmp_path, clean_environment).returncode == 1
 
 
 def test_doctor_names_a_bad_llvm(repository, clean_environment):

@@ -199,6 +199,8 @@ CHECKS: tuple[Callable[[], Iterable[Finding]], ...] = (
     check_kernel_cache,
     check_optional,
 )
+OF_THE_INSTALLATION = {check_python, check_packages, check_llvm, check_open3d, check_optional}
+"""What fails before anything is installed, and `check_python`, which comes first."""
 
 
 def _tried(what: str, code: str, answer: str, success: str, llvm: str = "") -> Finding:
@@ -251,10 +253,23 @@ def _control_group(name: str) -> list[str]:
         return []
 
 
+def check_nothing_yet() -> Iterator[Finding]:
+    yield Finding(
+        "ok", "packages", "not installed yet - the first `make scenes/kitchen` installs all (`bash envs/setup.sh` alone)"
+    )
+
+
+def checks(repository: Path = REPOSITORY) -> Iterable[Callable[[], Iterable[Finding]]]:
+    """Return the checks; before the installation, those of the machine alone."""
+    if (repository / ".venv").exists() or find_spec("snakemake") or find_spec("mitsuba"):
+        return CHECKS
+    return check_python, check_nothing_yet, *(one for one in CHECKS if one not in OF_THE_INSTALLATION)
+
+
 def main() -> int:
     """Print every finding as it is made; return 1 if any FAILs, else 0."""
     failed = False
-    for check in CHECKS:
+    for check in checks():
         try:
             findings = list(check())
         except Exception as error:  # a check that breaks must not hide the others
