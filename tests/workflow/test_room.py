@@ -215,10 +215,24 @@ def test_a_click_tells_the_object(room, stored):
     room.evaluate("room.setPose([1.5, 0.5, 1.0], [0, 0.75, 1.15])")
     box = room.locator("#view").bounding_box()
     room.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    assert "ceiling lamp" in room.inner_text("#object-name") and "radiance, red" in room.inner_text("#facts")
+    assert room.inner_text("#object-name") == "ceiling light 1"  # as its slider and the report call it
+    assert "ceiling lamp" in room.inner_text("#facts") and "radiance, red" in room.inner_text("#facts")
     room.focus("#view")
     room.keyboard.press("Escape")
     assert not room.is_visible("#card")
+
+
+def test_the_list_has_all_objects_in_order(room, stored):
+    """Numbers count as numbers, and what is hardly seen comes last."""
+    groups = room.evaluate(
+        "Array.from(document.querySelectorAll('#object optgroup'), group => Array.from(group.children, one => Number(one.value)))"
+    )
+    objects = {one["id"]: one for one in stored.document["objects"]}
+    assert sorted(sum(groups, [])) == sorted(objects)
+    for few, group in zip((False, True), groups, strict=False):
+        assert all((objects[i]["pixels"] < 100) == few for i in group)
+        names = [[int(w) if w.isdigit() else w for w in re.findall(r"\d+|\D+", objects[i]["name"].lower())] for i in group]
+        assert names == sorted(names)
 
 
 def test_what_is_selected_has_a_card_in_view_and_a_line_around_it(room, stored):
@@ -256,10 +270,13 @@ def test_lamps_have_sliders_numbers_and_colours(room, stored):
     lamp = room.locator("#lamps fieldset").first
     slider, exact, colour = (lamp.locator(name) for name in (".strength", ".exact", ".color"))
     before = np.array(room.evaluate("Array.from(room.light())"))
+    room.evaluate("room.showPhotograph(0)")
+    assert float(room.input_value("#over")) > 0
     slider.focus()
     for _ in range(5):
         room.keyboard.press("ArrowLeft")
     assert exact.input_value() == "0.95"
+    assert room.input_value("#over") == "0"  # it was taken under other light
     after = np.array(room.evaluate("Array.from(room.light())"))
     exact.fill("3.5")
     assert slider.input_value() == "2"  # its end

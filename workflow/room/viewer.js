@@ -677,8 +677,10 @@
         draw();
         return;
       }
-      const name = part && part.emitter >= 0 ? part.name : object ? object.name : part.name;
+      const lamp = part && part.emitter >= 0 && part.lamp >= 0 ? lamps[part.lamp].name : '';
+      const name = lamp || (object ? object.name : part.name);
       $('object-name').textContent = name;
+      if (lamp && object) row(table, 'on', object.name);
       if (object) {
         if (!part || part.emitter < 0) object.numbers.forEach((one) => row(table, one.name, number(one.value), between(one)));
         row(table, 'fitted', object.model);
@@ -815,14 +817,27 @@
     const blend = () => { $('photograph').style.opacity = $('over').value; };
     $('over').addEventListener('input', blend);
     blend();
+    /** Takes the photograph away: it shows neither other light nor a map. */
+    const uncover = () => {
+      $('over').value = '0';
+      blend();
+    };
+    $('lamps').addEventListener('input', uncover);
+    $('lamps').addEventListener('click', (event) => { if (event.target.closest('.off')) uncover(); });
+    document.querySelectorAll('input[name=mode]').forEach((input) => input.addEventListener('change', uncover));
     showPhotographControls();
 
     // --------------------------------------------------------------------------------------------------- panel: objects
 
-    data.objects
-      .map((object) => [object.name, object.id])
-      .sort((a, b) => (a[0] < b[0] ? -1 : a[0] > b[0] ? 1 : a[1] - b[1]))
-      .forEach(([name, id]) => $('object').append(new Option(`${name} (${id})`, String(id))));
+    const FEW = 100; // pixels of all photographs: people look for what is larger
+    const byName = [...data.objects].sort((a, b) => a.name.localeCompare(b.name, 'en', { numeric: true }) || a.id - b.id);
+    const groups = [['Objects', (object) => object.pixels >= FEW], ['Small, or hardly seen', (object) => object.pixels < FEW]];
+    groups.forEach(([title, holds]) => {
+      const group = document.createElement('optgroup');
+      group.label = title;
+      byName.filter(holds).forEach(({ name, id }) => group.append(new Option(`${name} (${id})`, String(id))));
+      if (group.children.length) $('object').append(group);
+    });
     $('object').addEventListener('change', () => select($('object').value === '' ? -1 : Number($('object').value)));
 
     $('close').addEventListener('click', () => {

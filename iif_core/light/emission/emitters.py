@@ -423,6 +423,8 @@ def solve(photos: Photographs, found: Traced, sky: Sky | None) -> EmissionSoluti
     solution, lamps = solve_families(problem.rows, prior, family, width), slice(groups.size)
     radiance = solution.radiance.copy()
     radiance[lamps] = likely_colours(radiance[lamps], solution.error[lamps], groups.area)
+    if sky is not None and sky.is_unseen:
+        radiance[together] = likely_colours(radiance[together], solution.error[together], sky.solid_angle[together - groups.size])
     return replace(solution, radiance=radiance).with_level_error(found.level_error)
 
 

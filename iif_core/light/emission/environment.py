@@ -49,6 +49,12 @@ class Sky:
         return len(self.pixels)
 
     @property
+    def solid_angle(self) -> np.ndarray:
+        """(E,) steradians of each group."""
+        angle = np.broadcast_to(solid_angles(*self.columns.shape), self.columns.shape)
+        return np.bincount(self.columns.ravel(), angle.ravel(), self.size)
+
+    @property
     def is_unseen(self) -> bool:
         """No camera sees any of the groups, as for those of `SkySums.directions`."""
         return not self.pixels.any()
