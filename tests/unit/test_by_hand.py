@@ -122,6 +122,12 @@ def test_equal_names_need_the_id():
     assert object_number("1", ["wall", "floor", "1"], "materials") == 2  # names come first
 
 
+def test_objects_with_a_word_of_what_was_asked_for_come_first():
+    names = [f"grey piece {i}" for i in range(20)] + ["white wall 1", "white wall 2"]
+    with refused("materials", "'wall'", "such as white wall 1, white wall 2, grey piece 0"):
+        object_number("wall", names, "materials")
+
+
 def settings_of(materials, **more):
     tree = {"source": {"kind": "builtin", "scene": "kitchen"}, "prior": {"kind": "simulated"}, "materials": materials, **more}
     return SceneSettings.model_validate(tree)

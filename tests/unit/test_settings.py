@@ -129,6 +129,7 @@ def test_scene_over_preset_over_default(scene):
         (f"{GOOD}affines: {{pixels: some}}\n", ["affines.pixels", "'some'", "'all'", 100]),
         ("prior: {kind: simulated}\n", ["source", "config/scenes/kitchen.yaml"]),
         ("source: {kind: builtin\n", ["line 2", "YAML"]),
+        (GOOD + "relight: [{name: off}]\n", ["relight.0.name", "False", "`off`", "quotes"]),
         ("- a\n- b\n", ["list", "key: value"]),
         (GOOD + "capture: {views: 3, views: 5}\n", ["line 3", "`views`"]),
         ("source: builtin\nprior: {kind: simulated}\n", ["source", "'builtin'", "source: {kind: ...}"]),

@@ -38,6 +38,8 @@ def object_number(key: object, names: list[str], where: str, new: Iterable[str] 
         return int(number[1])
     every = [*dict.fromkeys(new), *names]
     hint = did_you_mean(text, every, "{!r}")
+    words = set(text.lower().split())
+    every.sort(key=lambda name: not words & set(name.lower().split()))  # for "wall", the walls first
     listed = ", ".join(every[:8]) + (" ..." if len(every) > 8 else "")
     ids = f"an id (0 to {len(names) - 1})" if names else "an id"
     raise InputError(f"{where}: there is no object {text!r}.{hint} Allowed: {ids} or a name of objects.csv, such as {listed}")

@@ -206,7 +206,9 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
         else:
             said = shown(found, 200) if not isinstance(found, dict) else "'a mapping'"
             what = needed(problem)
-            if kind == "string_type" and isinstance(found, int | float):
+            if kind == "string_type" and isinstance(found, bool):
+                what = "Needed: text; YAML reads `on`, `off`, `yes` and `no` as true or false, so write it in quotes"
+            elif kind == "string_type" and isinstance(found, int | float):
                 what = f'Needed: text; YAML reads it as a number, so write it in quotes, such as "{found:03}"'
             elif kind == "string_pattern_mismatch" and where[-1] == "name":
                 what = "Needed: letters, digits, _ and -, beginning with a letter or a digit"
