@@ -346,3 +346,14 @@ def test_the_same_photographs_give_the_same_cameras_also_in_pairs_of_neighbours(
     monkeypatch.setattr(reconstruction, "EVERY_PAIR", 0)
     monkeypatch.setattr(reconstruction, "BESIDE", 4)
     assert len(reconstruction.find_cameras(tmp_path / "p", names, "file", lambda *_: None).names) >= 6
+
+
+def test_a_side_that_was_built_is_not_hidden_behind_what_was_found():
+    """Seen edge-on, what was found lies over what was built: the plan shows the share of each."""
+    from workflow.reconstruction.files import _seen_edge_on
+
+    points = np.repeat([[0.01, 1.01], [0.31, 1.01], [0.31, 2.01]], 10, axis=0)
+    found = np.r_[np.ones(10, bool), np.arange(10) < 4, np.zeros(10, bool)]
+    place, share = _seen_edge_on(points, found)
+    np.testing.assert_allclose(place, [[0.025, 1.025], [0.325, 1.025], [0.325, 2.025]])
+    np.testing.assert_allclose(share, [1.0, 0.4, 0.0])

@@ -15,6 +15,7 @@ from workflow.reconstruction.cameras import Sparse
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 SHOWN = 6  # depth maps in the picture
 _DOTS = 30_000
+_CELL = 0.05  # metres
 
 
 def transforms_json(sparse: Sparse) -> bytes:
@@ -27,13 +28,22 @@ def transforms_json(sparse: Sparse) -> bytes:
     return (json.dumps(document, indent=1) + "\n").encode()
 
 
+def _seen_edge_on(points: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the middles (k, 2) of the cells of a plan in which points (n, 2) lie, and the share of each that is `found` (n,)."""
+    cells, of = np.unique(np.floor(points / _CELL).astype(int), axis=0, return_inverse=True)
+    count = np.bincount(of.ravel(), minlength=len(cells))
+    return (cells + 0.5) * _CELL, np.bincount(of.ravel(), found, len(cells)) / np.maximum(count, 1)
+
+
 def overview_png(
     sparse: Sparse, vertices: np.ndarray, walls: Walls, pictures: Sequence[Picture], depths: Sequence[np.ndarray]
 ) -> bytes:
     """Draw the plan and a side view of mesh, added walls and cameras, and photographs beside their depth."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.figure import Figure
 
+    colours = LinearSegmentedColormap.from_list("built to found", ["tab:orange", "tab:green"])
     figure = Figure(figsize=(12, 9), layout="constrained")
     FigureCanvasAgg(figure)
     above, below = figure.subfigures(2, 1, height_ratios=(3, 2))
@@ -44,15 +54,15 @@ def overview_png(
     for axes, (i, j), title, cut in zip(
         above.subplots(1, 2), ((0, 1), (0, 2)), ("from above", "from the side"), (~level, level | across), strict=True
     ):
-        for own, colour, label in (
-            (~walls.found, "tab:orange", "flat side where nothing was found"),
-            (walls.found, "tab:green", "flat side, in the place of surface"),
-        ):
-            axes.plot(middle[cut & own, i], middle[cut & own, j], ".", ms=1.5, color=colour, alpha=0.4, label=label)
+        place, share = _seen_edge_on(middle[cut][:, [i, j]], walls.found[cut])
+        sides = axes.scatter(*place.T, c=share, s=4, cmap=colours, vmin=0, vmax=1)
         axes.plot(dots[:, i], dots[:, j], ",", color="0.4", label="surface that photographs show")
         axes.quiver(centre[:, i], centre[:, j], ahead[:, i], ahead[:, j], color="tab:blue", width=0.003, label="camera")
         axes.set(aspect="equal", xlabel=f"{'xyz'[i]} (m)", ylabel=f"{'xyz'[j]} (m)", title=title)
     above.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8, markerscale=6)
+    bar = above.colorbar(sides, ax=above.axes, shrink=0.6, ticks=(0, 1))
+    bar.set_ticklabels(["built", "found"])
+    bar.set_label("flat sides: share where surface was found", fontsize=8)
     shown = np.unique(np.linspace(0, len(pictures) - 1, SHOWN).round().astype(int))
     rows = below.subplots(2, len(shown), squeeze=False)
     far = float(np.nanquantile(np.concatenate([z[::4, ::4].ravel() for z in depths]), 0.98))
