@@ -1,9 +1,12 @@
 """Texels of the environment as groups, and what a room lit from outside makes of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from iif_core.light.emission.direct import solve_emission
+from iif_core.light.emission.emitters import likely_radiance
 from iif_core.light.emission.environment import HEIGHT, WIDTH, Sky, SkySums, cosine_directions, sky_prior, texels
 from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import assemble
@@ -135,6 +138,26 @@ def test_directions_of_an_open_mesh_are_unseen_and_share_the_sphere():
     np.testing.assert_allclose(share, 1 / 12, atol=0.03)
     up, down = sky.columns[0], sky.columns[-1]
     assert not set(up) & set(down)
+
+
+def test_light_from_where_no_camera_looks_has_likely_colours():
+    """A direction that noise made red comes near the others, as bright as before; a sun, and what cameras see, stay."""
+    sums = SkySums()
+    sums.add(np.array([[0.0, 0, 1]] * 5), np.full((5, 3), 2.0), np.zeros((5, 3), bool))
+    unseen = sums.directions()
+    np.testing.assert_allclose(unseen.solid_angle.sum(), 4 * np.pi)
+    radiance = np.full((13, 3), 1.0)
+    radiance[[3, 5]] = [0.9, 0.0, 0.0]
+    error = np.full((13, 3), 0.3)
+    area = np.ones(1)
+    found = likely_radiance(radiance, error, area, unseen)
+    np.testing.assert_allclose(found.mean(1), radiance.mean(1))
+    assert (found[[3, 5]].max(1) < 2 * found[[3, 5]].min(1)).all() and found[0].tolist() == [1.0, 1.0, 1.0]
+    with_sun = likely_radiance(radiance, error, area, replace(unseen, sun=2))
+    assert with_sun[3].tolist() == [0.9, 0.0, 0.0] and with_sun[5, 1] > 0.1
+    seen = replace(unseen, pixels=np.ones_like(unseen.pixels))
+    np.testing.assert_array_equal(likely_radiance(radiance, error, area, seen), radiance)
+    np.testing.assert_array_equal(likely_radiance(radiance[:1], error[:1], area, None), radiance[:1])
 
 
 def test_mean_through_sheets():

@@ -420,12 +420,25 @@ def solve(photos: Photographs, found: Traced, sky: Sky | None) -> EmissionSoluti
         outside = np.arange(found.groups.size, len(initial))
         together = outside if sky.sun is None else np.delete(outside, sky.sun)  # a sun is not like the sky around it
         family[together], width[together] = -1 - len(initial), OUTSIDE_WIDTH
-    solution, lamps = solve_families(problem.rows, prior, family, width), slice(groups.size)
-    radiance = solution.radiance.copy()
-    radiance[lamps] = likely_colours(radiance[lamps], solution.error[lamps], groups.area)
-    if sky is not None and sky.is_unseen:
-        radiance[together] = likely_colours(radiance[together], solution.error[together], sky.solid_angle[together - groups.size])
+    solution = solve_families(problem.rows, prior, family, width)
+    radiance = likely_radiance(solution.radiance, solution.error, groups.area, sky)
     return replace(solution, radiance=radiance).with_level_error(found.level_error)
+
+
+def likely_radiance(radiance: np.ndarray, error: np.ndarray, area: np.ndarray, sky: Sky | None) -> np.ndarray:
+    """Return the radiance (n, 3) of the groups with likely colours (`likely_colours`): of the lamps among themselves, and of what
+    comes from outside where no camera looks; what cameras see there has the colour that they see.
+
+    Args:
+        radiance, error: (n, 3) of the groups of `area` (G,) m^2, followed by those of the sky.
+    """
+    out, lamps = radiance.copy(), slice(len(area))
+    out[lamps] = likely_colours(radiance[lamps], error[lamps], area)
+    if sky is not None and sky.is_unseen:
+        own = np.arange(sky.size) if sky.sun is None else np.delete(np.arange(sky.size), sky.sun)
+        outside = len(area) + own
+        out[outside] = likely_colours(radiance[outside], error[outside], sky.solid_angle[own])
+    return out
 
 
 def _families(photos: Photographs, groups: EmitterGroups, n_groups: int) -> np.ndarray:
