@@ -577,7 +577,10 @@ CONVENTION = {"prior": "the mean albedo of the prior's predictions", "mean_albed
 
 
 def _scale(e: Evidence) -> Light:
-    patch = "Photograph a white patch of known albedo and name it (affines.scale: white_patch), or name a lamp of known radiance"
+    patch = (
+        "Photograph a white patch of known albedo, or take a wall whose paint you know, and name it in the scene file, such as"
+        " affines: {scale: {white_patch: {object: white wall 1, albedo: 0.8}}}; or name a lamp of known radiance"
+    )
     fixed = None
     if e.level in FIXED:
         fixed = Finding(
