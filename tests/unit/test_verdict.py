@@ -254,6 +254,10 @@ def test_every_light_says_what_its_colour_meant_in_rooms_with_truth():
         counts = calibration.measured()["lights"][light.name][light.level]
         assert 0 <= counts["right"] <= counts["of"] and f" {counts['of']} " in light.means
         assert green.document()["lights"][light.name]["means"]
+    for name, lights in calibration.measured()["lights"].items():  # of one result, all or none is right, which says nothing
+        for level in (AMBER, RED):
+            is_told = "as good all the same" in calibration.words(name, level, "it is")
+            assert is_told == (lights[level]["of"] >= 5)
     assert all(MEANS["geometry"].words in verdict.lights[0].means for verdict in (green, poor))
     assert green.lights[0].means != poor.lights[0].means
 

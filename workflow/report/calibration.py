@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 FILE = Path(__file__).resolve().with_name("calibration.json")
+FEW = 5
+"""Results of which no share is told."""
 
 
 @lru_cache(None)
@@ -31,5 +33,7 @@ def words(light: str, level: str, meaning: str) -> str:
     counts = found["lights"][light][level]
     if level == "green":
         return f"Green means that {meaning}. That was true of {counts['right']} of the {counts['of']} green ones of {made}."
+    if counts["of"] < FEW:
+        return f"Green means that {meaning}. Of {made}, only {counts['of']} had {level} here, too few to say what it means."
     of_them = f"Of {made}, {counts['of']} had {level} here, and {counts['right']} of these were as good all the same"
     return f"Green means that {meaning}. {of_them}."
