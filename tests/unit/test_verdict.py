@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from iif_core.camera.response import SATURATION, response
+from iif_core.evaluation.light import dark_where_saturated
 from workflow.decisions import materials
-from workflow.report import calibration, wording
+from workflow.report import calibration, evidence, wording
 from workflow.report.emitters import lamp_power
 from workflow.report.evidence import BRIGHT, SHOWN, doubtful_area
 from workflow.report.verdict import AMBER, GREEN, LIGHT_OF, LIMITS, MEANS, NOTED, ORDER, RED, Evidence, judge, limits_table
@@ -126,7 +128,7 @@ def test_nothing_known_is_never_green():
         ("escape", "geometry", RED), ("depth", "geometry", RED), ("agreement", "geometry", RED),
         ("photographed", "geometry", RED),
         ("misfit", "light", RED), ("doubtful_area", "light", AMBER), ("light_spread", "light", RED), ("albedo", "materials", RED),
-        ("unlikely_power", "light", AMBER),
+        ("unlikely_power", "light", AMBER), ("missed", "light", AMBER),
         ("roughness", "materials", RED), ("metallic", "materials", RED), ("uncertainty", "materials", RED),
         ("unfitted", "materials", RED), ("stability", "materials", AMBER), ("level_error", "scale", RED),
         ("raised", "scale", RED), ("light_scale", "scale", RED), ("discrepancy", "scale", RED),
@@ -143,6 +145,25 @@ def test_every_number_turns_its_light_at_its_limits(field, light, worst):
         assert found[light] == expected, (field, value)
         others = GREEN if field not in DOUBTS or expected == GREEN else AMBER
         assert all(level == others for name, level in found.items() if name != light)
+
+
+def test_lamps_that_are_missing_are_told_by_what_is_saturated():
+    light = judge(dataclasses.replace(GOOD, missed=0.116, missed_in=["019", "020"])).lights[1]
+    assert light.level == AMBER and "12 %" in light.findings[0].text and "019 and 020" in light.findings[0].text
+    assert evidence._missed({"share": 0.02, "dark_share": 0.3, "worst": ["a"]}) == {"missed": 0.3, "missed_in": ["a"]}
+    assert evidence._missed({"share": 0.0002, "dark_share": 1.0, "worst": ["a"]}) == evidence._missed({}) == {}
+
+
+def test_saturated_pixels_that_are_rendered_dark_are_counted():
+    """Nine pixels: saturated and bright, dark, dark in one channel, at the limit, not valid; and some that are not saturated."""
+    srgb, half = response("srgb"), 0.5 * response("srgb").inverse(np.full((1, 3), SATURATION))[0, 0]
+    at = float(srgb(np.full((1, 3), half))[0, 0])
+    photo = np.array([[1.0] * 3] * 5 + [[1.0, 1.0, 0.98], [0.2] * 3])
+    shown = np.array([[1.0] * 3, [0.1] * 3, [0.1, 0.1, 1.0], [at + 1e-6] * 3, [0.1] * 3, [0.1] * 3, [0.1] * 3])
+    valid = np.array([True, True, True, True, False, True, True])
+    assert dark_where_saturated(photo, shown, valid, srgb) == (4, 1)
+    shown[3] = at - 1e-6
+    assert dark_where_saturated(photo, shown, valid, srgb) == (4, 2)
 
 
 def test_the_score_of_held_out_photographs_counts_before_that_of_the_others():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,8 @@ NUMERICS = ("base", "emission", "shading", "affines")
 BRIGHT = 12.0
 """A surface that is at most so many times as bright as nine tenths of the room may reflect its light: a white ceiling around a
 lamp was 3 to 11 times as bright, window panes and lamp shades 11 to 80 times (lab/notebook/verdicts.md)."""
+LEAST_SATURATED = 1e-3
+"""Share of the pixels that must be saturated for what the re-rendering shows there to be told."""
 SHOWN = 0.2
 """A lamp that fewer pixels show than this share of what surface of its area has on average is hardly photographed."""
 
@@ -81,6 +84,7 @@ def evidence_of(scene: Reported) -> Evidence:
         environment=bool(np.any(recovered.light.environment)),
         doubtful_area=doubtful_area(light.table("emitters.parquet"), light.table("radiance_cache.parquet"), density),
         misfit=emission.get("misfit"),
+        **_missed(scene.document("render").get("saturated") or {}),
         light_spread=found(means, "rgb", "raw", "light_spread").get("mean"),
         held_out=psnr("rgb_held_out"),
         others=found(means, "rgb_held_out", "raw", "psnr", "photo_mean").get("mean"),
@@ -103,6 +107,13 @@ def evidence_of(scene: Reported) -> Evidence:
         discrepancy=(affines.get("level_errors") or {}).get("normalised_discrepancy"),
         warnings=[(stage, says) for stage in NUMERICS for says in numerics.warnings([(stage, scene.document(stage))])],
     )
+
+
+def _missed(saturated: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `missed` and `missed_in` of the evidence, from render.json; nothing where hardly anything is saturated."""
+    if saturated.get("share", 0.0) < LEAST_SATURATED:
+        return {}
+    return {"missed": saturated["dark_share"], "missed_in": saturated["worst"]}
 
 
 def doubtful_area(emitters: Mapping[str, np.ndarray], cache: Mapping[str, np.ndarray], pixels_per_m2: float) -> float:

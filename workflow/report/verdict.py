@@ -56,6 +56,7 @@ LIMITS: dict[str, Limit] = {
     "misfit": Limit(0.05, 0.4, "mean squared relative error of the light: good captures have 0.01 to 0.04; 0.4 is 60 %"),
     "doubtful_area": Limit(0.5, 2.0, "m^2 taken for lamps that hardly outshine the room, or are hardly photographed"),
     "unlikely_power": Limit(0.5, 1.0, "share of the power of lamps in those that are more likely surface: most of the light"),
+    "missed": Limit(0.1, 1.0, "of what is saturated in photographs; good captures have up to 0.05, half-seen windows 0.5"),
     "light_spread": Limit(0.1, 0.3, "spread of the light's error over objects, by the truth, as a logarithm: 10 % and 35 %"),
     "rerendering": Limit(20.0, 16.0, "dB: 20 is an error of 10 % of the sensor's range, 16 is one of 16 %"),
     "albedo": Limit(20.0, 14.0, "dB against the truth: 20 is an error of 0.1; one grey for a whole room reaches 10 to 12"),
@@ -72,7 +73,7 @@ LIMITS: dict[str, Limit] = {
 
 LIGHT_OF = {
     **dict.fromkeys(("escape", "depth", "edges", "agreement", "lost", "photographed"), "geometry"),
-    **dict.fromkeys(("misfit", "doubtful_area", "unlikely_power", "light_spread"), "light"),
+    **dict.fromkeys(("misfit", "doubtful_area", "unlikely_power", "missed", "light_spread"), "light"),
     **dict.fromkeys(("stability", "rerendering", "albedo", "roughness", "metallic"), "materials"),
     **dict.fromkeys(("uncertainty", "unfitted"), "materials"),
     **dict.fromkeys(("level_error", "raised", "light_scale", "discrepancy"), "scale"),
@@ -129,6 +130,7 @@ class Evidence:
         environment: whether light from outside was found.
         doubtful_area: m^2 of what was taken for lamps without clear evidence (`evidence.doubtful_area`).
         misfit: of the light; light_spread: of the light against the truth.
+        missed: share of what is saturated in photographs that is re-rendered dark; missed_in: photographs with most of it.
         worst: the photograph whose re-rendering is worst, and its PSNR.
         held_out, used: PSNR of re-renderings of photographs that were held out, and that were used.
         held_out_views: number of held-out photographs; others: PSNR of the mean of the other photographs on these;
@@ -164,6 +166,8 @@ class Evidence:
     doubtful_area: float | None = None
     misfit: float | None = None
     light_spread: float | None = None
+    missed: float | None = None
+    missed_in: Sequence[str] = ()
     held_out: float | None = None
     held_out_views: int = 0
     others: float | None = None
@@ -466,6 +470,12 @@ def _light(e: Evidence) -> Light:
                 shown=np.sqrt,
             ),
             _doubtful(e),
+            _finding(
+                "missed", e.missed, "Of what is saturated in photographs, {} is re-rendered at less than half of that"
+                + (f", most in {_joined(list(e.missed_in))}" if e.missed_in else ""),
+                "Look at what is white there: a lamp that is not in the list below is missing in the mesh, or torn; photograph it"
+                " from several sides", ".0%", AMBER,
+            ),
             _finding(
                 "light_spread", e.light_spread, "Against the truth, the error of the light varies by {} from object to object",
                 "Photograph each lamp and window from several sides", ".0%", shown=np.expm1,

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from iif_core.camera.pixels import pixel_gains, pixel_steps
 from iif_core.evaluation.consistency import held_out_gain
+from iif_core.evaluation.light import dark_where_saturated
 from workflow.artifacts.store import rgb, split_rgb
 from workflow.decisions import light as decisions
 from workflow.decisions.plan import ESCAPE_OPEN
@@ -22,6 +25,8 @@ from workflow.scene.recovered import read_recovered, read_response
 from workflow.scene.unexplained import Unexplained
 
 MAX_BOUNCES = 16  # of a path
+WORST = 3
+"""Photographs that are named where light is missing."""
 _SEEDS = 0x72656E  # keeps the random streams of this stage apart from those of others
 
 
@@ -51,6 +56,7 @@ def run(job: Job) -> None:
     job.log.info("views are re-rendered by %s", how)
     world = Scene(geometry, material, emitters, cache)
     found: dict[int, np.ndarray] = {}
+    bright: list[tuple[str, int, int, int]] = []
     unexplained = Unexplained(job, capture, scene, curve)
     through_holes = job.read("emission").json("emission.json")["escape_share"]["secondary"] > ESCAPE_OPEN
     white_balance = bool((gains.gain != gains.gain[:, :1]).any())
@@ -76,6 +82,10 @@ def run(job: Job) -> None:
         emission = scene.emission_map(face_id, eye)
         channels |= split_rgb(emission, "emission") | without_emitters(fitted, emission.any(-1))
         unexplained.add(view, radiance, factor, emission.any(-1))
+        if not capture.is_hdr and view.split != "test":
+            photo, valid = capture.photo(view)
+            valid &= face_id >= 0
+            bright.append((view.name, int(valid.sum()), *dark_where_saturated(photo, sensor, valid, curve)))
         attributes = view_attributes(view, float(factor.mean()))
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative", attributes=attributes)
     if found:
@@ -87,4 +97,16 @@ def run(job: Job) -> None:
     job.log.info("unexplained light: %s", decision["reason"])
     facts = {"beta": strength.beta.tolist(), "share": strength.share, "share_error": strength.error}
     plan = [decisions.denoiser(job.settings.render.denoise), decision]
-    job.writer.json("render.json", {"paths": how, "unexplained": facts, "plan": plan})
+    job.writer.json("render.json", {"paths": how, "unexplained": facts, "saturated": _saturated(bright), "plan": plan})
+
+
+def _saturated(views: list[tuple[str, int, int, int]]) -> dict[str, Any]:
+    """Return what render.json says of saturated pixels; of each view: its name, pixels, those that are saturated, and of these
+    those that are re-rendered dark."""
+    pixels, saturated, dark = (sum(view[i] for view in views) for i in (1, 2, 3))
+    worst = sorted((view for view in views if view[3]), key=lambda view: -view[3])[:WORST]
+    return {
+        "share": saturated / pixels if pixels else 0.0,
+        "dark_share": dark / saturated if saturated else 0.0,
+        "worst": [view[0] for view in worst],
+    }
