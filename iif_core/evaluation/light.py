@@ -3,10 +3,10 @@ saturated in photographs (docs/method/shading.md#re-rendering)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
-
-from iif_core.camera.response import SATURATION, Response
 
 DARK = 0.5
 """Part of the radiance that saturates, below which a re-rendering is dark there."""
@@ -14,18 +14,20 @@ SMALLEST_SHARE = 0.01
 """Share of the pixels from which an object counts."""
 
 
-def dark_where_saturated(photo: NDArray, shown: NDArray, valid: NDArray, response: Response) -> tuple[int, int]:
+def dark_where_saturated(
+    photo: NDArray, shown: NDArray, valid: NDArray, radiance: Callable[[NDArray], NDArray], saturation: float
+) -> tuple[int, int]:
     """Return how many pixels of a photograph are saturated in all channels, and how many of these the re-rendering shows with
     less than `DARK` of the radiance that saturates, in all channels: where they are lamps, these are missing.
 
     Args:
         photo, shown: (..., 3) sensor values in [0, 1] of the photograph and of its re-rendering.
         valid: (...) bool, pixels that count.
-        response: of the camera.
+        radiance: of sensor values (n, 3); saturation: sensor value from which a pixel is saturated.
     """
-    saturated = valid & (photo >= SATURATION).all(-1)
-    limit = DARK * response.inverse(np.full((1, 3), SATURATION))
-    dark = saturated & (response.inverse(np.clip(shown, 0.0, SATURATION)) < limit).all(-1)
+    saturated = valid & (photo >= saturation).all(-1)
+    limit = DARK * radiance(np.full((1, 3), saturation))
+    dark = saturated & (radiance(np.clip(shown, 0.0, saturation)) < limit).all(-1)
     return int(saturated.sum()), int(dark.sum())
 
 

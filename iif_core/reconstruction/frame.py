@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from iif_core.camera.pinhole import up_axis
 from iif_core.surface.enclosure import directions, fitted_plane
 from iif_core.surface.triangles import face_geometry
 
@@ -73,7 +72,7 @@ def room_frame(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLi
     return RoomFrame(np.stack([along, np.cross(up, along), up]), *_ends(middle @ up, area, np.abs(normal @ up) > LEVEL))
 
 
-def upward(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLike) -> NDArray:
+def upward(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLike, axis: NDArray) -> NDArray:
     """Return what is up (3,) in a capture whose coordinates may lean, as those of COLMAP and of depth cameras do: the axis
     nearest to the vertical of the cameras, unless the surface says otherwise.
 
@@ -83,8 +82,8 @@ def upward(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLike) 
     Args:
         vertices, faces: (n, 3) and (m, 3), in any unit.
         world_from_camera: (v, 3 or 4, 4) poses, OpenCV axes.
+        axis: (3,) the axis of the coordinates that is nearest to the vertical of the cameras.
     """
-    axis = up_axis(world_from_camera)
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
     normal, area = face_geometry(vertices, faces)
     up = _vertical(vertices[faces].mean(1), normal, area, directions(normal, area), world_from_camera)

@@ -8,6 +8,7 @@ import trimesh
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
+from iif_core.camera.pinhole import up_axis
 from iif_core.reconstruction.agreement import agreed, votes
 from iif_core.reconstruction.flat import flat_depth, textured
 from iif_core.reconstruction.frame import room_frame, upright, upward
@@ -437,7 +438,8 @@ def test_what_is_up_in_a_room_that_leans(angle):
     vertices, faces = room(((1, 1),))
     moved = np.eye(4)
     moved[:3, :3] = Rotation.from_rotvec(np.radians(angle) * np.array([0.6, -0.8, 0.0])).as_matrix()
-    up = upward(vertices @ moved[:3, :3].T, faces, moved @ _eyes())
+    poses = moved @ _eyes()
+    up = upward(vertices @ moved[:3, :3].T, faces, poses, up_axis(poses))
     assert np.degrees(np.arccos(min(up @ moved[:3, 2], 1.0))) < 0.2
 
 
@@ -445,11 +447,11 @@ def test_an_axis_is_up_unless_the_floor_says_otherwise():
     """Exactly so, with noise and a roof that slopes: it is larger than the floor, which is level all the same."""
     vertices, faces = room(((1, 1),))
     noisy = vertices + np.random.default_rng(0).normal(0, 0.01, vertices.shape)
-    np.testing.assert_array_equal(upward(noisy, faces, _eyes()), [0, 0, 1])
+    np.testing.assert_array_equal(upward(noisy, faces, _eyes(), np.array([0.0, 0, 1])), [0, 0, 1])
     roof = np.array([[-4.0, -3, 1.3], [4, -3, 1.3], [4, 3, 3.4], [-4, 3, 3.4]])  # 15 degrees
     every = np.concatenate([faces, np.array([[0, 2, 1], [0, 3, 2]]) + len(vertices)])
     assert room_frame(np.concatenate([vertices, roof]), every, _eyes()).turn[2, 2] < 0.98  # the roof is taken for level
-    np.testing.assert_array_equal(upward(np.concatenate([vertices, roof]), every, _eyes()), [0, 0, 1])
+    np.testing.assert_array_equal(upward(np.concatenate([vertices, roof]), every, _eyes(), np.array([0.0, 0, 1])), [0, 0, 1])
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -161,9 +161,9 @@ def test_saturated_pixels_that_are_rendered_dark_are_counted():
     photo = np.array([[1.0] * 3] * 5 + [[1.0, 1.0, 0.98], [0.2] * 3])
     shown = np.array([[1.0] * 3, [0.1] * 3, [0.1, 0.1, 1.0], [at + 1e-6] * 3, [0.1] * 3, [0.1] * 3, [0.1] * 3])
     valid = np.array([True, True, True, True, False, True, True])
-    assert dark_where_saturated(photo, shown, valid, srgb) == (4, 1)
+    assert dark_where_saturated(photo, shown, valid, srgb.inverse, SATURATION) == (4, 1)
     shown[3] = at - 1e-6
-    assert dark_where_saturated(photo, shown, valid, srgb) == (4, 2)
+    assert dark_where_saturated(photo, shown, valid, srgb.inverse, SATURATION) == (4, 2)
 
 
 def test_the_score_of_held_out_photographs_counts_before_that_of_the_others():

@@ -362,7 +362,8 @@ def _upward(surface: mesh.Mesh, views: list[View], said: list[str]) -> dict[str,
     """Return `up`, an entry of capture.json, where the capture leans in its coordinates, and say so. Else the reader takes the
     axis nearest to the cameras' (`CaptureReader.up`)."""
     poses = np.stack([view.world_from_camera for view in views])
-    up, axis = upward(surface.vertices, surface.faces, poses), up_axis(poses)
+    axis = up_axis(poses)
+    up = upward(surface.vertices, surface.faces, poses, axis)
     if (up == axis).all():
         return {}
     angle = np.degrees(np.arccos(np.clip(up @ axis, -1.0, 1.0)))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.camera.pixels import pixel_gains, pixel_steps
+from iif_core.camera.response import SATURATION
 from iif_core.evaluation.consistency import held_out_gain
 from iif_core.evaluation.light import dark_where_saturated
 from workflow.artifacts.store import rgb, split_rgb
@@ -85,7 +86,7 @@ def run(job: Job) -> None:
         if not capture.is_hdr and view.split != "test":
             photo, valid = capture.photo(view)
             valid &= face_id >= 0
-            bright.append((view.name, int(valid.sum()), *dark_where_saturated(photo, sensor, valid, curve)))
+            bright.append((view.name, int(valid.sum()), *dark_where_saturated(photo, sensor, valid, curve.inverse, SATURATION)))
         attributes = view_attributes(view, float(factor.mean()))
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative", attributes=attributes)
     if found:
