@@ -530,7 +530,7 @@ def test_the_panes_of_a_window_are_called_together():
     lamps = [Lamp(0, (1,), 1.0, "window 1"), Lamp(1, (2,), 1.0, "window 1"), Lamp(4, (3,), 1.0, "lamp 1")]
     room = Inventory(["wall", "pane", "pane", "bulb"], lamps)
     assert room.lamps_called("window 1", "x") == [0, 1] and room.lamps_called("lamp 1", "x") == [2]
-    with refused("relight.lamps", "'window 2'", "'window 1'", "window 1, lamp 1;"):
+    with refused("relight.lamps", "'window 2'", "'window 1'", "window 1 (emitter 0, 1), lamp 1 (emitter 4);"):
         room.lamps_called("window 2", "relight.lamps")
     with refused("relight.lamps", "'light from outside'", "environment: off"):
         room.lamps_called("light from outside", "relight.lamps")

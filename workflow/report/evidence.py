@@ -22,7 +22,7 @@ NUMERICS = ("base", "emission", "shading", "affines")
 BRIGHT = 12.0
 """A surface that is at most so many times as bright as nine tenths of the room may reflect its light: a white ceiling around a
 lamp was 3 to 11 times as bright, window panes and lamp shades 11 to 80 times (lab/notebook/verdicts.md)."""
-LEAST_SATURATED = 1e-3
+LEAST_SATURATED = 5e-3
 """Share of the pixels that must be saturated for what the re-rendering shows there to be told."""
 SHOWN = 0.2
 """A lamp that fewer pixels show than this share of what surface of its area has on average is hardly photographed."""
