@@ -47,10 +47,6 @@ def scenes_to_show(named: Sequence[str] = ()) -> list[str]:
     return list(dict.fromkeys([*of_table, *(name for name in folders if name not in RESERVED)]))
 
 
-def _of_table() -> list[str]:
-    return [line.name for line in batch_table.read_table()]
-
-
 def tell(named: Sequence[str], quality_of: Callable[[str], str], as_json: bool = False) -> int:
     """Print where scenes stand; return the exit code, which is 1 if the batch table cannot be read.
 
@@ -69,7 +65,9 @@ def tell(named: Sequence[str], quality_of: Callable[[str], str], as_json: bool =
     found = list(standing.survey(scenes, quality_of))
     width = shutil.get_terminal_size((UNBOUNDED, 24)).columns  # or those that `COLUMNS` says, as `watch` does
     lines = [json_line(one, now) for one in found] if as_json else text(found, now, width)
-    others = [] if named or as_json or code else sorted({*scene_names(), *_of_table()} - set(scenes))
+    others = []
+    if not (named or as_json or code):
+        others = sorted({*scene_names(), *(line.name for line in batch_table.read_table())} - set(scenes))
     if others:
         lines.append(f"never begun: {', '.join(others)}")
     try:

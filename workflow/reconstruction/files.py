@@ -31,8 +31,7 @@ def transforms_json(sparse: Sparse) -> bytes:
 def _seen_edge_on(points: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the middles (k, 2) of the cells of a plan in which points (n, 2) lie, and the share of each that is `found` (n,)."""
     cells, of = np.unique(np.floor(points / _CELL).astype(int), axis=0, return_inverse=True)
-    count = np.bincount(of.ravel(), minlength=len(cells))
-    return (cells + 0.5) * _CELL, np.bincount(of.ravel(), found, len(cells)) / np.maximum(count, 1)
+    return (cells + 0.5) * _CELL, np.bincount(of.ravel(), found, len(cells)) / np.bincount(of.ravel(), minlength=len(cells))
 
 
 def overview_png(

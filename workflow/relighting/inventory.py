@@ -70,6 +70,18 @@ class Inventory:
         more = f" and {len(lamp.objects) - 1} more" if len(lamp.objects) > 1 else ""
         return f"{(self.shown or self.names)[lamp.objects[0]]}{more}"
 
+    def called(self, lamp: Lamp) -> str:
+        """Return what people call a lamp: its name by where it is, or else what it is on."""
+        return lamp.name or self.name_of(lamp)
+
+    @property
+    def by_name(self) -> dict[str, list[Lamp]]:
+        """The lamps by what people call them, which the panes of a window share."""
+        out: dict[str, list[Lamp]] = {}
+        for lamp in self.lamps:
+            out.setdefault(self.called(lamp), []).append(lamp)
+        return out
+
     def is_called(self, number: int, key: str) -> bool:
         """Return whether a key of the settings is the name of an object, as people see it or as the segmentation gave it."""
         return key == self.names[number] or key in self.shown[number : number + 1]
@@ -96,11 +108,10 @@ class Inventory:
         found = placed or on_object or [i for i, lamp in enumerate(self.lamps) if key == str(lamp.emitter_id)]
         if found:
             return found
-        each: dict[str, list[str]] = {}
-        for lamp in self.lamps:
-            each.setdefault(lamp.name or self.name_of(lamp), []).append(str(lamp.emitter_id))
-        listed = [f"{name} (emitter {', '.join(ids)})" for name, ids in each.items()]
-        there = f"{', '.join(listed[:8])}; the report lists them" if each else "none"
+        listed = [
+            f"{name} (emitter {', '.join(str(lamp.emitter_id) for lamp in members)})" for name, members in self.by_name.items()
+        ]
+        there = f"{', '.join(listed[:8])}; the report lists them" if listed else "none"
         if key == OUTSIDE:
             raise InputError(f"{where}: {key!r} is no lamp; `environment` switches and dims it: `environment: off`")
         known = [(self.shown or self.names)[o] for lamp in self.lamps for o in lamp.objects]
@@ -112,13 +123,11 @@ class Inventory:
     def captions(self, changes: Mapping[str, str]) -> list[str]:
         """Return what happens to which lamps as people call them: by name where all of that name change alike (`window 1 off`),
         else with the emitters that do (`ceiling light 1 (emitter 2) off`); `changes`: key of the settings -> what changes."""
-        members: dict[str, list[Lamp]] = {}
-        for lamp in self.lamps:
-            members.setdefault(lamp.name or self.name_of(lamp), []).append(lamp)
+        members = self.by_name
         told: dict[tuple[str, str], list[int]] = {}
         for key, change in changes.items():
             for lamp in (self.lamps[i] for i in self.lamps_called(key, "relight.lamps")):
-                told.setdefault((lamp.name or self.name_of(lamp), change), []).append(lamp.emitter_id)
+                told.setdefault((self.called(lamp), change), []).append(lamp.emitter_id)
         out = []
         for (name, change), some in told.items():
             ids = ", ".join(f"emitter {one}" for one in sorted(some))

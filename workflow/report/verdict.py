@@ -459,6 +459,8 @@ def _light(e: Evidence) -> Light:
             RED, f"{counted} and no light from outside: nothing{' else' if e.lamps else ''} lights the room",
             "Photograph a lamp or the window, and keep its surface in the mesh",
         )  # fmt: skip
+    is_missed = e.missed_in and LIMITS["missed"].level(e.missed or 0.0) != GREEN
+    where = f", most in {_joined(list(e.missed_in))}" if is_missed else ""
     return _made(
         "light",
         "Was found what lights the room?",
@@ -471,8 +473,7 @@ def _light(e: Evidence) -> Light:
             ),
             _doubtful(e),
             _finding(
-                "missed", e.missed, "Of what is saturated in photographs, {} is re-rendered at less than half of that"
-                + (f", most in {_joined(list(e.missed_in))}" if e.missed_in else ""),
+                "missed", e.missed, f"Of what is saturated in photographs, {{}} is re-rendered at less than half of that{where}",
                 "Look at what is white there: a lamp that is not in the list below is missing in the mesh, or torn; photograph it"
                 " from several sides", ".0%", AMBER,
             ),

@@ -199,8 +199,8 @@ CHECKS: tuple[Callable[[], Iterable[Finding]], ...] = (
     check_kernel_cache,
     check_optional,
 )
-OF_THE_INSTALLATION = {check_python, check_packages, check_llvm, check_open3d, check_optional}
-"""What fails before anything is installed, and `check_python`, which comes first."""
+NEED_PACKAGES = {check_llvm, check_open3d, check_optional}
+"""Checks that fail before anything is installed."""
 
 
 def _tried(what: str, code: str, answer: str, success: str, llvm: str = "") -> Finding:
@@ -263,7 +263,7 @@ def checks(repository: Path = REPOSITORY) -> Iterable[Callable[[], Iterable[Find
     """Return the checks; before the installation, those of the machine alone."""
     if (repository / ".venv").exists() or find_spec("snakemake") or find_spec("mitsuba"):
         return CHECKS
-    return check_python, check_nothing_yet, *(one for one in CHECKS if one not in OF_THE_INSTALLATION)
+    return [check_nothing_yet if one is check_packages else one for one in CHECKS if one not in NEED_PACKAGES]
 
 
 def main() -> int:

@@ -85,8 +85,8 @@ def run(job: Job) -> None:
         unexplained.add(view, radiance, factor, emission.any(-1))
         if not capture.is_hdr and view.split != "test":
             photo, valid = capture.photo(view)
-            valid &= face_id >= 0
-            bright.append((view.name, int(valid.sum()), *dark_where_saturated(photo, sensor, valid, curve.inverse, SATURATION)))
+            own = valid & (face_id >= 0)
+            bright.append((view.name, int(own.sum()), *dark_where_saturated(photo, sensor, own, curve.inverse, SATURATION)))
         attributes = view_attributes(view, float(factor.mean()))
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative", attributes=attributes)
     if found:

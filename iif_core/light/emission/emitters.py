@@ -417,8 +417,7 @@ def solve(photos: Photographs, found: Traced, sky: Sky | None) -> EmissionSoluti
     family[: groups.size] = _kinds(photos, groups, family[: groups.size], alike)
     width = np.full(len(initial), FAMILY_WIDTH)
     if sky is not None and sky.is_unseen:
-        outside = np.arange(found.groups.size, len(initial))
-        together = outside if sky.sun is None else np.delete(outside, sky.sun)  # a sun is not like the sky around it
+        together = groups.size + sky.no_sun
         family[together], width[together] = -1 - len(initial), OUTSIDE_WIDTH
     solution = solve_families(problem.rows, prior, family, width)
     radiance = likely_radiance(solution.radiance, solution.error, groups.area, sky)
@@ -435,9 +434,8 @@ def likely_radiance(radiance: np.ndarray, error: np.ndarray, area: np.ndarray, s
     out, lamps = radiance.copy(), slice(len(area))
     out[lamps] = likely_colours(radiance[lamps], error[lamps], area)
     if sky is not None and sky.is_unseen:
-        own = np.arange(sky.size) if sky.sun is None else np.delete(np.arange(sky.size), sky.sun)
-        outside = len(area) + own
-        out[outside] = likely_colours(radiance[outside], error[outside], sky.solid_angle[own])
+        outside = len(area) + sky.no_sun
+        out[outside] = likely_colours(radiance[outside], error[outside], sky.solid_angle[sky.no_sun])
     return out
 
 

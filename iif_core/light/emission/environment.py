@@ -49,6 +49,12 @@ class Sky:
         return len(self.pixels)
 
     @property
+    def no_sun(self) -> np.ndarray:
+        """(k,) numbers of the groups that are no sun, which is not like the sky around it."""
+        every = np.arange(self.size)
+        return every if self.sun is None else np.delete(every, self.sun)
+
+    @property
     def solid_angle(self) -> np.ndarray:
         """(E,) steradians of each group."""
         angle = np.broadcast_to(solid_angles(*self.columns.shape), self.columns.shape)
