@@ -15,6 +15,11 @@ LEVEL, UPRIGHT = 0.8, 0.35  # cosines with the vertical from which, and up to wh
 MOST = 0.6  # share of its area that makes an object level or upright
 WIDE, WALL = 0.5, 1.5  # m^2 from which level surface is a floor or a ceiling, upright surface a wall
 NEAR, HIGH = 0.12, 0.4  # of the height of the room: distance from its ends of floors and ceilings; height of a wall
+FRONT = 0.05  # m^2 from which flat upright surface is a front
+FLAT = 0.9  # share of the normals of a flat object that its mean normal keeps
+PARALLEL, PLANE = 0.97, 0.06  # cosine between normals, and metres, up to which pieces lie in one plane
+BEYOND, CLEAR = 0.15, 0.04  # metres behind a side of the room, and the share of all surface that may lie there
+ALIKE = 20.0  # distance in CIELAB up to which a piece in the plane of a wall is part of it
 GREY = 10.0  # chroma below which a colour is grey
 _GREYS = ((25.0, "black"), (45.0, "dark grey"), (62.0, "grey"), (78.0, "light grey"), (101.0, "white"))
 _HUES = (
@@ -59,7 +64,9 @@ def described(
 
     Of objects with the same name the largest has the number 1. Parts of a room are told by where faces look and lie: level
     surface at the bottom and at the top of the room is floor and ceiling, between them a `top` (of a table, a shelf); large and
-    high upright surface is a wall; the rest are pieces. Which side of a face is its front does not count.
+    high upright surface is a wall, and so are flat pieces that make up such a surface together, of like colour and with hardly
+    anything behind them; other flat upright pieces are a `front` (of a cupboard, a door, a picture); the rest are pieces. Which
+    side of a face is its front does not count.
 
     Args:
         object_of_face: (m,) from 0 without gaps.
@@ -92,6 +99,8 @@ def described(
     bottom, top = (middle[order][min(np.searchsorted(share, at), len(order) - 1)] for at in (0.01, 0.99))
     tall = max(float(top - bottom), 1e-12)
 
+    known = np.asarray(seen, bool) & np.isfinite(np.asarray(albedo, np.float64)).all(1)
+    sides = _Sides(label, normal, area, vertices[faces].mean(1), upright, low, high)
     kinds = []
     for i in range(count):
         if level[i]:
@@ -100,9 +109,11 @@ def described(
             ceiling = at_end and place[i] >= top - NEAR * tall
             kinds.append("floor" if floor else "ceiling" if ceiling else "top")
         else:
-            kinds.append("wall" if upright[i] and size[i] >= WALL and high[i] - low[i] >= HIGH * tall else "piece")
+            wall = upright[i] and size[i] >= WALL and high[i] - low[i] >= HIGH * tall
+            kinds.append("wall" if wall else "front" if sides.flat[i] and size[i] >= FRONT else "piece")
+    for i in sides.walls(np.asarray(albedo, np.float64), known, HIGH * tall):
+        kinds[i] = "wall"
     added = np.zeros(count, bool) if built is None else np.asarray(built, bool)
-    known = np.asarray(seen, bool) & np.isfinite(np.asarray(albedo, np.float64)).all(1)
     colours = ["added" if a else colour_name(c) if s else "unseen" for a, c, s in zip(added, albedo, known, strict=True)]
     names = [f"{colour} {kind}" for colour, kind in zip(colours, kinds, strict=True)]
 
@@ -124,3 +135,47 @@ def _vertical(normal: NDArray, area: NDArray, up: NDArray) -> NDArray:
         return up
     axis = np.linalg.eigh((normal[own] * area[own, None]).T @ normal[own])[1][:, -1]
     return axis if axis @ up > 0 else -axis
+
+
+class _Sides:
+    """The planes of flat upright objects: which of them make up a wall together.
+
+    Attributes:
+        flat: (objects,) bool, they are upright and their normals are alike.
+    """
+
+    def __init__(self, label, normal, area, middle, upright, low, high):
+        count = len(upright)
+        self.size, self.low, self.high = np.bincount(label, area, count), low, high
+        self.middle, self.area = middle, area
+        total = np.maximum(self.size, 1e-300)
+        # The axis along which most of an object's normals lie, whatever their signs.
+        moment = np.stack([np.bincount(label, area * normal[:, i] * normal[:, j], count) for i in range(3) for j in range(3)], 1)
+        values, vectors = np.linalg.eigh(moment.reshape(count, 3, 3) / total[:, None, None])
+        self.axis = vectors[:, :, -1]
+        self.flat = upright & (values[:, -1] >= FLAT)
+        self.centre = np.stack([np.bincount(label, area * middle[:, i], count) for i in range(3)], 1) / total[:, None]
+
+    def walls(self, albedo: NDArray, known: NDArray, high: float) -> list[int]:
+        """Return the objects that make up walls: in one plane, of one colour, with hardly anything behind them.
+
+        Args:
+            albedo, known: (objects, 3) linear Rec.709, and whether it is known; what nobody has seen joins any wall.
+            high: metres that a wall reaches over.
+        """
+        lab = lab_from_linear(np.clip(np.where(known[:, None], albedo, 0), 0, 1))
+        left, out = self.flat.copy(), []
+        for seed in np.argsort(-self.size, kind="stable"):
+            if not left[seed]:
+                continue
+            axis, at = self.axis[seed], self.axis[seed] @ self.centre[seed]
+            near = left & (np.abs(self.axis @ axis) >= PARALLEL) & (np.abs(self.centre @ axis - at) <= PLANE)
+            alike = near & (~known | ~known[seed] | (np.linalg.norm(lab - lab[seed], axis=1) <= ALIKE))
+            offset = self.middle @ axis - at
+            behind = min(self.area[offset > BEYOND].sum(), self.area[offset < -BEYOND].sum())
+            reach = self.high[alike].max() - self.low[alike].min()
+            if self.size[alike].sum() >= WALL and reach >= high and behind <= CLEAR * self.area.sum():
+                out += np.flatnonzero(alike).tolist()
+                left &= ~alike
+            left[seed] = False
+        return out

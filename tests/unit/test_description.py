@@ -42,6 +42,57 @@ def test_a_room_is_called_by_its_parts(turned, flipped):
     assert names[4:] == ["brown floor", "white ceiling", "blue top", "blue piece"]
 
 
+def rectangle(x, y, z):
+    """A rectangle in the plane across the axis of which one number is given, of the others the ends; vertices and two faces."""
+    a, b = (i for i, v in enumerate((x, y, z)) if not np.isscalar(v))
+    ends = [(v, v) if np.isscalar(v) else v for v in (x, y, z)]
+    corners = []
+    for u, v in ((0, 0), (1, 0), (1, 1), (0, 1)):
+        corner = [end[0] for end in ends]
+        corner[a], corner[b] = ends[a][u], ends[b][v]
+        corners.append(corner)
+    return np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def built_up(*rectangles):
+    parts = [rectangle(*one) for one in rectangles]
+    vertices = np.concatenate([v for v, _ in parts])
+    return vertices, np.concatenate([f + 4 * i for i, (_, f) in enumerate(parts)]), np.repeat(np.arange(len(parts)), 2)
+
+
+ROOM = [((0, 4), (0, 4), 0.0), ((0, 4), (0, 4), 2.5)]  # floor and ceiling
+STRIPS = [(0.02 * i, (i, i + 1), (0.0, 1.25)) for i in range(3)] + [(0.0, (3, 4), (1.25, 2.5))]  # in a scan with noise
+
+
+@pytest.mark.parametrize(
+    ("more", "colour", "kinds"),
+    [
+        ([], GREY, ["wall"] * 4),
+        # Of another colour: the last one hangs on the wall.
+        ([], (0.3, 0.02, 0.02), ["wall"] * 3 + ["front"]),
+        # The same in the middle of the room, or before a room behind it, are fronts of cupboards.
+        ([(-0.6, (0, 4), (0.0, 2.5)), (4.0, (0, 4), (0.0, 2.5))], GREY, ["front"] * 4),
+    ],
+)
+def test_pieces_of_a_wall_are_a_wall_together_and_other_flat_pieces_are_fronts(more, colour, kinds):
+    vertices, faces, label = built_up(*ROOM, *STRIPS, *more)
+    count = label.max() + 1
+    colours = np.tile(GREY, (count, 1))
+    colours[5] = colour
+    names = described(label, vertices, faces, colours, np.ones(count, bool), (0, 0, 1))
+    assert [" ".join(c for c in name.split() if c in ("wall", "front", "piece")) for name in names[2:6]] == kinds
+    if more:
+        assert all("wall" in name for name in names[6:])
+
+
+def test_low_pieces_and_small_ones_are_no_wall():
+    low = [(0.0, (i, i + 1), (0.0, 0.8)) for i in range(4)]
+    small = [(4.0, (0.0, 0.1), (0.0, 0.1))]
+    vertices, faces, label = built_up(*ROOM, *low, *small)
+    names = described(label, vertices, faces, np.tile(GREY, (7, 1)), np.ones(7, bool), (0, 0, 1))
+    assert sum("front" in name for name in names) == 4 and "piece" in names[-1]
+
+
 def test_what_nobody_saw_and_what_was_built_say_so():
     vertices, faces, label = furnished()
     seen = np.arange(8) != 4
