@@ -10,6 +10,8 @@ from tests.errors import refused
 from tests.unit import own_scene as own
 from workflow.artifacts import StageReader
 from workflow.artifacts.store import ids_from_disk
+from workflow.intake.ply import face_properties
+from workflow.segmentations import given
 from workflow.segmentations.face_colour import mean_face_colour
 
 
@@ -110,6 +112,28 @@ def test_given_without_ids_says_what_to_do(tmp_path):
     own.photographed(path, 2, depth=False)
     with refused("segmentation: {kind: given}", "segmentation: {kind: geometry}"):
         own.run(tmp_path, "capture", "segmentation")
+
+
+def test_given_without_ids_is_refused_before_any_work_where_files_tell(tmp_path):
+    """A PLY of which faces have no `instance` and no maps beside the photographs, and photographs alone."""
+    own.photographed(tmp_path, 2, depth=False)
+    settings = own.settings_of(tmp_path)
+    with refused("segmentation: {kind: given}", "segmentation: {kind: geometry}"):
+        given.raw_inputs(settings)
+    with refused("segmentation: {kind: given}"):
+        given.raw_inputs(settings | {"source": settings["source"] | {"kind": "photographs"}})
+    (tmp_path / "instances").mkdir()
+    Image.fromarray(np.zeros((own.CAMERA.height, own.CAMERA.width), np.uint8)).save(tmp_path / "instances/000.png")
+    assert given.raw_inputs(settings) == []
+
+
+@pytest.mark.parametrize("faces", ["property list uchar int vertex_indices\nproperty int instance", "property int instance"])
+def test_properties_of_faces_are_those_of_the_header(tmp_path, faces):
+    path = tmp_path / "mesh.ply"
+    path.write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 0\nproperty float instance_of_vertex\nelement face 0\n{faces}\nend_header\n"
+    )
+    assert face_properties(path) - {"vertex_indices"} == {"instance"}
 
 
 @pytest.mark.parametrize(

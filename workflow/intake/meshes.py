@@ -11,7 +11,7 @@ from workflow.intake import limits
 from workflow.intake.documents import check_file
 
 AGAIN = "export the mesh again, or copy it again"
-_HEADER_BYTES = 1 << 20
+HEADER_BYTES = 1 << 20
 _SIZES = {
     **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
     **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
@@ -35,7 +35,7 @@ def check_mesh(path: Path) -> None:
 
 def _check_ply(path: Path, size: int) -> None:
     with path.open("rb") as file:
-        head, mark, _ = file.read(_HEADER_BYTES).partition(b"end_header")
+        head, mark, _ = file.read(HEADER_BYTES).partition(b"end_header")
     if not mark:
         raise InputError(f"{path}: cut short (its header has no end); {AGAIN}")
     ascii_form, elements = b"format ascii" in head, []

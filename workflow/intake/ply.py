@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from iif_core.errors import InputError
-from workflow.intake.meshes import AGAIN, check_faces
+from workflow.intake.meshes import AGAIN, HEADER_BYTES, check_faces
 from workflow.intake.polygons import naming, triangulated
 
 Array = np.ndarray
@@ -73,6 +73,15 @@ def read_ply(path: Path) -> tuple[Array, Array, Array | None]:
     with naming(path):
         faces, place = triangulated(vertices, polygons)
     return vertices, faces, None if ids is None else ids[place].astype(np.float64)
+
+
+def face_properties(path: Path) -> set[str]:
+    """Return the names of the properties of faces in the header of a file that was checked before (`meshes.check_mesh`)."""
+    with path.open("rb") as file:
+        head = file.read(HEADER_BYTES)
+    mark = re.search(rb"^end_header", head, re.MULTILINE)
+    elements = _header(path, head[: mark.start()])[1] if mark else []
+    return {name for element in elements if element.name == "face" for name, _, _ in element.properties}
 
 
 def _header(path: Path, head: bytes) -> tuple[str, list[_Element]]:

@@ -2,15 +2,41 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.surface.segments import vote_faces
+from workflow.intake.ply import face_properties
 from workflow.segmentations.surface import Objects, Surface
+from workflow.sources.folder_scene.inputs import find_inputs
 
 PERTURBED = "every third photograph's ids left out"
+NO_IDS = (
+    "`segmentation: {kind: given}`, but the capture has no instance ids, neither of faces nor of views;"
+    " give `instances/<view>.png` or an `instance` property of the mesh's faces (docs/guide/own-data.md),"
+    " or set `segmentation: {kind: geometry}`"
+)
+
+
+def raw_inputs(document: dict[str, Any]) -> list[Path]:
+    """List no files, as the capture holds the ids.
+
+    Raises:
+        InputError: they can be nowhere: photographs alone, or a folder without maps of ids whose mesh is a PLY without them.
+    """
+    source = document["source"]
+    if source["kind"] == "photographs":
+        raise InputError(NO_IDS)
+    if source["kind"] == "folder":
+        inputs = find_inputs(source, document["capture"])
+        of_views = any(frame.ids is not None for frame in inputs.cameras.frames)
+        if not of_views and inputs.mesh.suffix.lower() == ".ply" and "instance" not in face_properties(inputs.mesh):
+            raise InputError(NO_IDS)
+    return []
 
 
 def segment(surface: Surface, settings: SimpleNamespace, fold: int | None = None) -> Objects:
@@ -49,11 +75,7 @@ def _by_view(surface: Surface, fold: int | None) -> Objects:
             face_ids.append(surface.decoded.gbuffer(view)[1].ravel())
             instance_ids.append(given.ravel())
     if not face_ids:
-        raise InputError(
-            "`segmentation: {kind: given}`, but the capture has no instance ids, neither of faces nor of views;"
-            " give `instances/<view>.png` or an `instance` property of the mesh's faces (docs/guide/own-data.md),"
-            " or set `segmentation: {kind: geometry}`"
-        )
+        raise InputError(NO_IDS)
     face, instance = np.concatenate(face_ids), np.concatenate(instance_ids)
     if not ((face >= 0) & (instance >= 0)).any():
         raise InputError(
