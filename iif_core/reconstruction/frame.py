@@ -23,6 +23,9 @@ NOISE = 0.005
 """Share of the level surface below the floor, and above the ceiling: depth that is wrong."""
 LEAST = 0.005
 """Least share of the area that makes a floor or a ceiling."""
+BEYOND, BEYOND_SHARE = 0.1, 0.02
+"""What lies below level surface by more than this part of the height, as a share of all surface, makes it a table and no floor;
+above it, a lamp or a shelf and no ceiling."""
 LEANS = float(np.radians(2.0))
 """Angle between the vertical and an axis up to which the axis is the vertical: floors of scans are off by up to 0.8 degrees."""
 NEAR = float(np.radians(5.0))
@@ -69,7 +72,8 @@ def room_frame(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLi
     along = across[0] if len(across) else np.eye(3)[np.abs(up).argmin()]
     along = along - (along @ up) * up
     along /= np.linalg.norm(along)
-    return RoomFrame(np.stack([along, np.cross(up, along), up]), *_ends(middle @ up, area, np.abs(normal @ up) > LEVEL))
+    ends = _ends(middle @ up, area, np.abs(normal @ up) > LEVEL, BEYOND_SHARE)
+    return RoomFrame(np.stack([along, np.cross(up, along), up]), *ends)
 
 
 def upward(vertices: ArrayLike, faces: ArrayLike, world_from_camera: ArrayLike, axis: NDArray) -> NDArray:
@@ -127,13 +131,14 @@ def upright(world_from_camera: ArrayLike) -> NDArray:
     return up / max(float(np.linalg.norm(up)), 1e-12)
 
 
-def _ends(height: NDArray, area: NDArray, level: NDArray) -> tuple[float, float, bool, bool]:
+def _ends(height: NDArray, area: NDArray, level: NDArray, most_beyond: float = 1.0) -> tuple[float, float, bool, bool]:
     """Return where most level surface lies in the lowest and in the highest third of the room, else where all surface ends; and
     whether there is such surface.
 
     Args:
         height, area: (m,) of the faces.
         level: (m,) bool.
+        most_beyond: share of all surface that may lie further out than such surface by `BEYOND` of the height.
     """
     order = np.argsort(height)
     share = np.cumsum(area[order]) / area.sum()
@@ -143,9 +148,12 @@ def _ends(height: NDArray, area: NDArray, level: NDArray) -> tuple[float, float,
     filled = np.convolve(np.bincount(place, area * level, BINS), np.ones(3), "same")
     third = BINS // 3
     out, there = [], []
-    for first, end in ((0, low), (BINS - third, high)):
+    for first, end, outward in ((0, low, -1), (BINS - third, high, 1)):
         peak = first + int(filled[first : first + third].argmax())
         own = (np.abs(place - peak) <= 1) & level
-        there.append(bool(area[own].sum() >= LEAST * area.sum()))
-        out.append(float(np.average(height[own], weights=area[own])) if there[-1] else end)
+        found = float(np.average(height[own], weights=area[own])) if area[own].sum() >= LEAST * area.sum() else None
+        if found is not None and area[outward * (height - found) > BEYOND * (high - low)].sum() > most_beyond * area.sum():
+            found = None
+        there.append(found is not None)
+        out.append(end if found is None else found)
     return out[0], out[1], there[0], there[1]

@@ -653,6 +653,15 @@ def test_a_finished_scene_fits_itself(tmp_path):
     assert own.run(tmp_path, "capture").facts["alignment"]["edge_correlation"] > 0.2
 
 
+@pytest.mark.parametrize(("factor", "by"), [(100.0, "0.01"), (1000.0, "0.001")])
+def test_a_mesh_in_another_unit_than_the_poses_is_told_the_factor_that_fits(factor, by):
+    """Never one that would make the room smaller than the space in which its photographs were taken."""
+    vertices, faces, _ = own.room_mesh()
+    centres = np.array([pose[:3, 3] for pose in own.poses(5)])
+    with refused("mesh.ply", f"by {by}"):
+        mesh.check_size(Path("mesh.ply"), mesh.Mesh(vertices * factor, faces), "m", 1.0, centres)
+
+
 def test_a_factor_between_mesh_and_poses_is_named():
     room = mesh.Mesh(*own.room_mesh()[:2])
     centres = np.array([pose[:3, 3] for pose in own.poses(5)])

@@ -50,7 +50,7 @@ def test_blurred_and_badly_posed_views_are_named(found):
 
 def test_cameras_are_corrected_and_read_back(found):
     frames, poses, out = found
-    assert out.facts["accepted"] and "moved by" in out.notes[0]
+    assert out.facts["accepted"] and "lay beside the mesh by" in out.notes[0]
     (decision,) = out.plan
     assert decision["included"] and decision["value"] > decision["threshold"] and "photographs moved by" in decision["reason"]
     alike, other = ("all alike", "each for itself")[:: -1 if out.facts["each"] else 1]

@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -334,6 +335,66 @@ def test_exif_of_any_length_fits_into_a_working_copy(tmp_path):
     reconstruction._working_copy(tmp_path / "a.png", tmp_path / "w", 0, Counter(), "file")
     with Image.open(tmp_path / "w/000/000000.jpg") as copy:
         assert copy.getexif().get_ifd(0x8769)[41989] == 28
+
+
+@pytest.mark.long
+def test_photographs_of_little_contrast_are_placed_by_fainter_features(tmp_path, monkeypatch):
+    """A quarter of the contrast of the other tests, in 8 bits: COLMAP's own features are too few."""
+    photographed(tmp_path / "p", 12)
+    names = sorted(path.name for path in (tmp_path / "p").glob("*.png"))
+    for name in names:
+        levels = np.asarray(Image.open(tmp_path / "p" / name), np.float64)
+        Image.fromarray(np.rint(128 + 0.25 * (levels - levels.mean())).astype(np.uint8)).save(tmp_path / "p" / name)
+    assert len(reconstruction.find_cameras(tmp_path / "p", names, "file", lambda *_: None).names) >= 6
+    monkeypatch.setattr(reconstruction, "FAINT", 0.0067)
+    with refused("0 of 12 photographs hang together"):
+        reconstruction.find_cameras(tmp_path / "p", names, "file", lambda *_: None)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "kept", "tries"),
+    [
+        ([[18], [20]], 18, 1),  # nearly all: nothing else is tried
+        ([[11, 7], [17, 3]], 17, 2),
+        ([[], [15]], 15, 2),
+        ([[13], [12, 8]], 13, 2),  # the better of the two
+        ([[9], [8]], 0, 2),
+    ],
+)
+def test_fainter_features_are_looked_for_where_too_few_photographs_hang_together(tmp_path, monkeypatch, sizes, kept, tries):
+    pycolmap, asked = pytest.importorskip("pycolmap"), []
+
+    def group(count):
+        return SimpleNamespace(num_reg_images=lambda: count, num_points3D=lambda: 5, images={})
+
+    def mapped(*_):
+        return dict(enumerate(group(count) for count in sizes[len(asked) - 1]))
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", mapped)
+    monkeypatch.setattr(reconstruction, "_working_copy", lambda *_: (8, 6))
+    monkeypatch.setattr(reconstruction, "_compare", lambda database, work, count, faint, progress: asked.append(faint))
+    monkeypatch.setattr(reconstruction, "_plain", lambda model, names, sizes: model.num_reg_images())
+    names = [f"{i}.jpg" for i in range(20)]
+    if kept:
+        assert reconstruction.find_cameras(tmp_path, names, "file", lambda *_: None) == kept
+    else:
+        with refused("9 of 20 photographs hang together", "at least 10"):
+            reconstruction.find_cameras(tmp_path, names, "file", lambda *_: None)
+    assert asked == [False, True][:tries]
+
+
+def test_photographs_that_fall_apart_are_told_by_groups():
+    names = [f"{i}.jpg" for i in range(40)]
+
+    def group(*places):
+        images = {i: SimpleNamespace(name=f"000/{i:06d}.jpg", has_pose=True) for i in places}
+        return SimpleNamespace(images=images | {99: SimpleNamespace(name="000/000039.jpg", has_pose=False)})
+
+    told = reconstruction._told([group(0, 1, 2, 7), group(4, 5)], names)
+    assert "2 groups: 0.jpg to 2.jpg, 7.jpg; 4.jpg to 5.jpg." in told and "39.jpg" not in told
+    assert "These do: 3.jpg." in reconstruction._told([group(3)], names) and "These do" not in reconstruction._told([], names)
+    many = reconstruction.ranges(range(0, 40, 2), names)
+    assert many.endswith("14.jpg, 12 more") and reconstruction.ranges({0, 1}, names) == "0.jpg to 1.jpg"
 
 
 @pytest.mark.long

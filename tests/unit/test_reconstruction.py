@@ -428,6 +428,21 @@ def test_the_vertical_of_cameras_that_look_down():
     np.testing.assert_allclose(upright(same), -same[0, :3, 1])
 
 
+@pytest.mark.parametrize(("deep", "has_floor"), [(0.0, True), (1.0, False)])
+def test_a_table_with_the_room_below_it_is_no_floor(deep, has_floor):
+    """Walls go on below the lowest level surface, which nothing of the floor itself joins."""
+    vertices, faces = room()
+    level = np.abs(face_geometry(vertices, faces)[0][:, 2]) > 0.9
+    is_floor = level & (vertices[faces].mean(1)[:, 2] < vertices[:, 2].mean())
+    bottom = vertices[:, 2].min()
+    table = np.array([[-0.6, -0.5, bottom], [0.6, -0.5, bottom], [0.6, 0.5, bottom], [-0.6, 0.5, bottom]])
+    lower = vertices - [0, 0, deep] * (vertices[:, 2:] < bottom + 1e-6)
+    every = np.concatenate([faces[~is_floor], np.array([[0, 1, 2], [0, 2, 3]]) + len(vertices)])
+    frame = room_frame(np.concatenate([lower, table]), every, _eyes())
+    assert (frame.has_floor, frame.has_ceiling) == (has_floor, True)
+    assert frame.floor == pytest.approx(bottom - 2 / 3 * deep, abs=0.06)  # the middle of the lowest faces
+
+
 def _eyes():
     eyes = [(-1.0, 0.5, 0.2), (1.0, -0.5, 0.3), (0.3, 1.0, 0.1)]
     return np.array([np.linalg.inv(np.vstack([looking(eye, (0.2, 0.1, -0.5)), [0, 0, 0, 1]])) for eye in eyes])

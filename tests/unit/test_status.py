@@ -250,6 +250,15 @@ def test_scenes_that_were_never_begun_are_named(project, capsys):
     assert status.tell(["x"], lambda _: "draft") == 0 and "never begun" not in capsys.readouterr().out
 
 
+def test_a_finished_scene_has_the_sentence_of_its_report(project, capsys):
+    path = Path("scenes/a/verdict.json")
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps({"verdict": "poor", "sentence": "Do not rely on this.\n"}))
+    published(files={"verdict.json": {"sha256": sha256_of(path), "bytes": path.stat().st_size}})
+    assert stand().verdict == "Do not rely on this. "
+    assert status.tell(["a"], lambda _: "draft") == 0 and "Do not rely on this." in capsys.readouterr().out
+
+
 def test_a_file_of_a_deliverable_that_was_changed_is_told(project):
     path = Path("scenes/a/verdict.json")
     path.parent.mkdir(parents=True)
@@ -435,6 +444,6 @@ def test_json_has_these_keys():
     found = json.loads(status.json_line(standing.Standing("a", "failed", since=1.7e9), 1.7e9 + 3))
     assert list(found) == [
         *("scene", "state", "stage", "running", "quality", "since", "expected_seconds", "cpu_seconds", "max_rss_mb"),
-        *("remaining_cpu_seconds", "reason", "log", "line", "seconds"),
+        *("remaining_cpu_seconds", "reason", "verdict", "log", "line", "seconds"),
     ]
     assert (found["since"], found["seconds"]) == ("2023-11-14T22:13:20Z", 3.0)

@@ -48,6 +48,7 @@ class Standing:
         cpu_seconds, max_rss_mb: that its jobs took: the last run of each, and of running ones so far.
         remaining_cpu_seconds: of the jobs that are missing; None for scenes that are done or refused.
         reason: why it is not done, where there is one; or how a job ended since, if it is done.
+        verdict: what the report of a finished scene says of it, in a sentence.
         log, line: of the job of `stage`, or of that job: its path, and the last line that is not empty.
     """
 
@@ -62,6 +63,7 @@ class Standing:
     max_rss_mb: float = 0.0
     remaining_cpu_seconds: float | None = None
     reason: str = ""
+    verdict: str = ""
     log: str = ""
     line: str = ""
 
@@ -116,7 +118,7 @@ def _at_rest(found: Standing, jobs: dict[str, Noted]) -> Standing:
     if current and not faults:
         how = f"it is published, but its last job of {ended[0]} {ended[1].state}: {ended[1].reason}" if ended else ""
         log = ended[1].log if ended else f"results/{scene}/logs/publish.log"
-        return replace(found, state="done", since=touched, reason=how, **_logged(log))
+        return replace(found, state="done", since=touched, reason=how, verdict=verdict_of(scene), **_logged(log))
     stage = missing[0] if missing else "publish"
     found = replace(found, stage=stage, since=touched, remaining_cpu_seconds=_cpu_seconds(scene, quality, missing))
     if ended and not current:
@@ -130,6 +132,12 @@ def _at_rest(found: Standing, jobs: dict[str, Noted]) -> Standing:
         why = f"made at quality {made}" if made != quality else "settings, inputs or code changed since"
         return replace(found, state="stale", reason=why)
     return found
+
+
+def verdict_of(scene: str) -> str:
+    """Return the sentence of the report of a published scene; nothing where it cannot be read."""
+    sentence = facts_in(f"scenes/{scene}/verdict.json").get("sentence")
+    return printable(sentence) if isinstance(sentence, str) else ""
 
 
 def _ended(jobs: dict[str, Noted], stages: list[str], scene: str, quality: str) -> tuple[str, Noted] | None:

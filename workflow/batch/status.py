@@ -99,7 +99,7 @@ def text(found: Sequence[Standing], now: float, width: int) -> list[str]:
         stage = f"{one.stage} +{len(one.running) - 1}" if len(one.running) > 1 else one.stage
         cpu = duration(one.cpu_seconds) if one.cpu_seconds else ""
         memory = size(one.max_rss_mb) if one.max_rss_mb else ""
-        rows.append((one.scene, one.state, stage, _age(one, now), cpu, memory, printable(one.reason or one.line)))
+        rows.append((one.scene, one.state, stage, _age(one, now), cpu, memory, printable(one.reason or one.verdict or one.line)))
     widths = [max(len(row[i]) for row in rows) for i in range(6)]
     out = []
     for row in rows:

@@ -38,7 +38,7 @@ def sun(found: SunEvidence | None) -> Decision:
 def emitters(groups: int, dropped: int, candidates: int) -> Decision:
     """Decide about emitters: groups of faces that were found and kept by the solver."""
     if groups:
-        reason = f"{groups} groups emit light ({dropped} candidates dropped)"
+        reason = f"{groups} group{' emits' if groups == 1 else 's emit'} light ({dropped} candidates dropped)"
     elif candidates:
         reason = f"none of the {candidates} candidate groups emits light; light comes from cache and environment"
     else:

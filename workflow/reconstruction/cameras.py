@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,13 @@ bricks and tiles repeat."""
 REPROJECTED = 1.5
 """Pixels of the copies between a feature and its point, beyond which the two are not of each other (COLMAP: 4): matches that
 are a little wrong, as along bricks, bend a ring of cameras."""
+FAINT = 0.002
+"""Least contrast of a feature (COLMAP: 0.0067) where too few photographs hang together without: rooms of plain walls have few."""
+ENOUGH = 0.9
+"""Share of the photographs with a camera from which on fainter features are not looked for: they take longer, and what is found
+without them is as right."""
+RANGES = 8
+"""Names, or first and last names, that a message lists."""
 LEAST, LEAST_SHARE = 3, 0.5
 """Photographs that must hang together, and share of all."""
 _SEED = 0
@@ -110,35 +117,72 @@ def find_cameras(root: Path, names: Sequence[str], colour: str, progress: Progre
 
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     with tempfile.TemporaryDirectory(prefix="iif-") as folder:
-        work, database, cameras = Path(folder) / "images", Path(folder) / "database.db", Counter()
+        work, cameras = Path(folder) / "images", Counter()
         sizes = []
         for number, name in enumerate(names):
             sizes.append(_working_copy(root / name, work, number, cameras, colour))
             progress(number + 1, len(names), "photographs read")
-        pycolmap.set_random_seed(_SEED)
-        _compare(database, work, len(names), progress)
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = 1
         options.random_seed = _SEED
         options.mapper.abs_pose_min_num_inliers, options.mapper.abs_pose_min_inlier_ratio = INLIERS
         options.mapper.filter_max_reproj_error = REPROJECTED
         options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = REPROJECTED
-        (Path(folder) / "sparse").mkdir()
-        found = pycolmap.incremental_mapping(database, work, Path(folder) / "sparse", options)
-    most = max(found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()), default=None)
-    count = 0 if most is None else most.num_reg_images()
+        groups: list[Any] = []
+        for faint in (False, True):
+            sparse, database = Path(folder) / f"sparse{faint:d}", Path(folder) / f"{faint:d}.db"
+            sparse.mkdir()
+            pycolmap.set_random_seed(_SEED)
+            _compare(database, work, len(names), faint, progress)
+            found = pycolmap.incremental_mapping(database, work, sparse, options).values()
+            groups = max(groups, sorted(found, key=_size, reverse=True), key=lambda own: _size(own[0]) if own else (0, 0))
+            if groups and groups[0].num_reg_images() >= ENOUGH * len(names):
+                break
+    count = groups[0].num_reg_images() if groups else 0
     least = max(LEAST, int(np.ceil(LEAST_SHARE * len(names))))
-    if most is None or count < least:
+    if count < least:
         raise InputError(
-            f"{root}: {count} of {len(names)} photographs hang together; at least {least} must. Take more of them, each of which"
-            " shows most of what another shows, from another place (not only turned), sharp, and of things with texture"
-            " (docs/guide/programs.md#photographs-alone)"
+            f"{root}: {count} of {len(names)} photographs hang together; at least {least} must. {_told(groups, names)}"
         )
-    return _plain(most, names, sizes)
+    return _plain(groups[0], names, sizes)
 
 
-def _compare(database: Path, work: Path, count: int, progress: Progress) -> None:
-    """Find features and matches of the working copies, into COLMAP's database."""
+def _size(model: Any) -> tuple[int, int]:
+    return model.num_reg_images(), model.num_points3D()
+
+
+def _told(groups: Sequence[Any], names: Sequence[str]) -> str:
+    """Say which photographs hang together, and what to do: `IMG_1 to IMG_8, IMG_20`."""
+    found = [ranges({int(Path(image.name).stem) for image in own.images.values() if image.has_pose}, names) for own in groups]
+    rule = (
+        "each of which shows most of what another shows, from another place (not only turned), sharp, and of things with texture"
+        " (docs/guide/programs.md#photographs-alone)"
+    )
+    if len(found) > 1:
+        return (
+            f"They fall into {len(found)} groups: {'; '.join(found)}. Take more photographs between the groups, {rule}; or leave"
+            " those of one group alone in the folder, for that part of the room"
+        )
+    return f"{f'These do: {found[0]}. ' if found else ''}Take more of them, {rule}"
+
+
+def ranges(places: Collection[int], names: Sequence[str]) -> str:
+    """Return names by their place in the order of all, those that follow each other as `first to last`; of many, some.
+
+    >>> ranges({0, 1, 2, 4}, ["a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg"])
+    'a.jpg to c.jpg, e.jpg'
+    """
+    ordered, out = sorted(places), []
+    starts = [i for i, place in enumerate(ordered) if not i or place != ordered[i - 1] + 1]
+    for first, end in zip(starts, [*starts[1:], len(ordered)], strict=False):
+        own = [names[ordered[first]], names[ordered[end - 1]]]
+        out.append(own[0] if end - first == 1 else " to ".join(own))
+    return ", ".join([*out[:RANGES], *([f"{len(out) - RANGES} more"] if len(out) > RANGES else [])])
+
+
+def _compare(database: Path, work: Path, count: int, faint: bool, progress: Progress) -> None:
+    """Find features and matches of the working copies, into COLMAP's database; `faint`: also features of little contrast, and
+    more matches along the lines on which those that are found allow them."""
     import pycolmap
 
     cpu = pycolmap.Device.cpu
@@ -149,9 +193,11 @@ def _compare(database: Path, work: Path, count: int, progress: Progress) -> None
     )
     extraction.num_threads = matching.num_threads = 1
     extraction.sift.max_num_features = FEATURES
+    if faint:
+        extraction.sift.peak_threshold, matching.guided_matching = FAINT, True
     reader.camera_model = "SIMPLE_RADIAL"
     by_folder = pycolmap.CameraMode.PER_FOLDER
-    progress(0, count, "features")
+    progress(0, count, "fainter features" if faint else "features")
     pycolmap.extract_features(
         database, work, camera_mode=by_folder, reader_options=reader, extraction_options=extraction, device=cpu
     )

@@ -27,7 +27,7 @@ def facts_of(scene: Reported, quality: str) -> list[tuple[str, str]]:
         ("quality", quality),
         ("source", str(capture.facts.get("source", ""))),
         ("photographs", f"{len(capture.views)} of {size} pixels, {capture.facts['dynamic_range'].upper()}"),
-        *([("held out", f"{held_out} photographs were not used")] if held_out else []),
+        *([("held out", f"{held_out} photograph{'s were' if held_out > 1 else ' was'} not used")] if held_out else []),
         ("exposures", f"{stops:.1f} stops apart" if stops > 0.01 else "all equal"),
         ("mesh", f"{number(len(surface.faces))} faces, {' x '.join(f'{side:.2f}' for side in extent)} m"),
         ("objects", objects_words(scene.document("segmentation"), len(scene.recovered.object_names))),

@@ -72,7 +72,8 @@ def headline(summary: Mapping[str, Any], has_lamps: bool, has_truth: bool) -> st
     if corrected:
         text += f" With the light that the model lacks, as the other photographs show it: {corrected['mean']:.1f} dB."
     if held_out:
-        text += f" On the {held_out['views']} held-out photographs: {held_out['mean']:.1f} dB"
+        count = held_out["views"]
+        text += f" On the {f'{count} held-out photographs' if count != 1 else 'held-out photograph'}: {held_out['mean']:.1f} dB"
         text += f", with that light {corrected_held_out['mean']:.1f} dB." if corrected_held_out else "."
         mean, blend = (found(means, "rgb_held_out", "raw", "psnr", variant) for variant in ("photo_mean", "photo_nearest"))
         if mean and blend:

@@ -59,6 +59,7 @@ LIMITS: dict[str, Limit] = {
     "missed": Limit(0.1, 1.0, "of what is saturated in photographs; good captures have up to 0.05, half-seen windows 0.5"),
     "light_spread": Limit(0.1, 0.3, "spread of the light's error over objects, by the truth, as a logarithm: 10 % and 35 %"),
     "rerendering": Limit(20.0, 16.0, "dB: 20 is an error of 10 % of the sensor's range, 16 is one of 16 %"),
+    "rival": Limit(1.0, 99.0, "dB by which the mean of other photographs, which knows no light, predicts held-out ones better"),
     "albedo": Limit(20.0, 14.0, "dB against the truth: 20 is an error of 0.1; one grey for a whole room reaches 10 to 12"),
     "roughness": Limit(20.0, 10.0, "dB against the truth: 20 is an error of 0.1, 10 one of 0.3; rooms have 13 to 24"),
     "metallic": Limit(20.0, 10.0, "dB against the truth: 20 is an error of 0.1; rooms, mostly without metal, have 19 or more"),
@@ -74,7 +75,7 @@ LIMITS: dict[str, Limit] = {
 LIGHT_OF = {
     **dict.fromkeys(("escape", "depth", "edges", "agreement", "lost", "photographed"), "geometry"),
     **dict.fromkeys(("misfit", "doubtful_area", "unlikely_power", "missed", "light_spread"), "light"),
-    **dict.fromkeys(("stability", "rerendering", "albedo", "roughness", "metallic"), "materials"),
+    **dict.fromkeys(("stability", "rerendering", "rival", "albedo", "roughness", "metallic"), "materials"),
     **dict.fromkeys(("uncertainty", "unfitted"), "materials"),
     **dict.fromkeys(("level_error", "raised", "light_scale", "discrepancy"), "scale"),
 }
@@ -498,13 +499,19 @@ def _materials(e: Evidence) -> Light:
         held = _counted(e.held_out_views, "held-out photograph")
         each = np.array(e.held_out_each)
         ends = f" ({each.min():.1f} to {each.max():.1f})" if len(each) > 1 else ""
-        rival = "" if e.others is None else f"; the mean of the other photographs, which knows no light, has {e.others:.1f} there"
         # Of a few photographs, one good one does not make up for most that are not.
         usual = min(e.held_out, float(np.median(each))) if len(each) else e.held_out
         scored = _finding(
-            "rerendering", usual, f"Re-renderings reach {e.held_out:.1f} dB PSNR on {held}{ends}{rival}{worst}", _WORST_VIEWS
+            "rerendering", usual, f"Re-renderings reach {e.held_out:.1f} dB PSNR on {held}{ends}{worst}", _WORST_VIEWS
         )
+        behind = None if e.others is None else e.others - e.held_out
+        rival = _finding(
+            "rival", behind, f"The mean of other photographs, which knows no light, predicts them with {e.others or 0.0:.1f} dB",
+            "Light or materials are wrong where the error maps are bright: relit pictures will be, too. Look for lamps that are"
+            " missing, and for a mesh that does not lie on the photographs", worst=AMBER,
+        )  # fmt: skip
     else:
+        rival = None
         scored = _finding(
             "rerendering", e.used, f"Re-renderings reach {{}} dB PSNR on the photographs{worst}",
             _WORST_VIEWS, ".1f",
@@ -528,6 +535,7 @@ def _materials(e: Evidence) -> Light:
         "Are albedo, roughness and metallic those of the room?",
         [
             scored,
+            rival,
             _finding(
                 "albedo", e.albedo,
                 f"Albedo reaches {{}} dB PSNR against the truth, an error of about {_off(e.albedo or 0.0):.2f}",
@@ -617,9 +625,10 @@ def _scale(e: Evidence) -> Light:
             fixed,
             _finding(
                 "raised", e.raised, "All light was raised by a factor of {}, so that albedos stay below 1",
-                "Light is missing: photograph every lamp and window and close the mesh"
-                + ("" if e.level in FIXED else ", or fix the level by a white patch"), ".2f",
-            ) if not e.raised <= 1 else Finding(GREEN, "No light had to be added to keep albedos below 1"),
+                "Light is missing: photograph every lamp and window and close the mesh, or fix the level by a white patch", ".2f",
+            ) if not e.raised <= 1 and e.level not in FIXED else None if e.level in FIXED else Finding(
+                GREEN, "No light had to be added to keep albedos below 1"
+            ),
             _finding(
                 "light_scale", moved, "The light that was found and the albedo that was predicted disagree by a factor of {}"
                 f" (the albedos were divided by {e.light_scale:.3g})", patch, ".2f",

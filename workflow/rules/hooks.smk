@@ -63,7 +63,7 @@ def damages():
 
 
 def tell_results():
-    """Say whether scenes reached the score that was asked for and, after the last line of Snakemake, where to look: the pages of
+    """Say whether scenes reached the score that was asked for and, after the last line of Snakemake, what their reports say and where to look: the pages of
     the scenes that were made, or of the batch, and the contact sheets of relightings."""
     if not workflow.is_main_process:
         return
@@ -73,6 +73,9 @@ def tell_results():
     asked = {(job.rule.name, job.wildcards.scene) for job in workflow.dag.jobs if "scene" in job.wildcards.keys()}
     made = [path.parent for path in Path("scenes").glob("*/manifest.json") if ("publish", path.parent.name) in asked]
     made = [folder for folder in made if (folder / "manifest.json").stat().st_mtime >= STARTED]
+    from workflow.batch.standing import verdict_of  # slow to import, and only needed at the end
+
+    verdicts = [f"{folder.name}: {said}" for folder in sorted(made) if (said := verdict_of(folder.name))]
     pages = [folder / page for folder in sorted(made) for page in ("report.html", "room.html")]
     found_cameras = sorted(Path("results").glob("*/reconstruction/overview.png"))
     pages += [path for path in found_cameras if ("reconstruction", path.parts[1]) in asked and path.stat().st_mtime >= STARTED]
@@ -83,4 +86,5 @@ def tell_results():
     pages += [path for path in sheets if path.parts[1] in relit]
     found = [str(page.resolve()) for page in pages if page.is_file()]
     if found:
-        atexit.register(print, "\nOpen: " + "\n      ".join(found), file=sys.stderr)
+        said = "".join(f"\n{line}" for line in ([] if batch_asked else verdicts))
+        atexit.register(print, f"{said}\nOpen: " + "\n      ".join(found), file=sys.stderr)

@@ -18,7 +18,7 @@ from iif_core.reconstruction.neighbours import neighbours
 from iif_core.reconstruction.sweep import Picture, swept_depth
 from iif_core.reconstruction.walls import CLOSES, Walls, flat_walls, turn_to_walls
 from iif_core.surface.triangles import face_geometry
-from workflow.reconstruction.cameras import Sparse, find_cameras, picture_of
+from workflow.reconstruction.cameras import Sparse, find_cameras, picture_of, ranges
 from workflow.reconstruction.files import overview_png, transforms_json
 from workflow.runtime.job import Job
 from workflow.sources.folder_scene.frames import folder_at
@@ -263,9 +263,11 @@ def _facts(
             f"WARNING the room stays open: flat surface was found on {len(known)} of its {count} sides; show walls and ceiling"
             " too, from several places"
         )
+    everything = sorted([*sparse.names, *sparse.left_out])
     for why in dict.fromkeys(sparse.left_out.values()):
         names = [name for name, own in sparse.left_out.items() if own == why]
-        notes.append(f"{len(names)} photographs are left out, such as {names[0]}: {why}")
+        own = f"{len(names)} photographs are" if len(names) > 1 else "1 photograph is"
+        notes.append(f"{own} left out, {ranges([everything.index(name) for name in names], everything)}: {why}")
     share = len(sparse.left_out) / (len(sparse.left_out) + len(sparse.names))
     if share > MANY:
         notes.append(

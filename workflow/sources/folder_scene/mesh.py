@@ -365,9 +365,18 @@ def check_across(path: Path, vertices: np.ndarray, unit: str | float, metres: fl
     found = f"{path}: the scene is {diagonal:.4g} m across (allowed {low:g} to {high:g} m), read with `source.unit: {unit}`"
     cameras = 0.0 if centres is None else float(np.linalg.norm(np.ptp(centres, axis=0)))
     if diagonal > high and 0.1 < cameras < 1e-2 * diagonal:
+        # A room is larger than the space that its photographs are taken from.
+        units = {
+            name: factor for name, factor in METRES.items() if factor < metres and cameras <= diagonal * factor / metres <= high
+        }
+        name = min(units, key=lambda name: abs(np.log(diagonal * units[name] / metres / TYPICAL_DIAGONAL)), default=None)
+        likely = (
+            f": in {name} it would be {diagonal * units[name] / metres:.3g} m across, so" if name else "; bring it into theirs:"
+        )
+        by = f"{units[name] / metres:g}" if name else "<the right factor>"
         raise InputError(
-            f"{found}, but the cameras span {cameras:.3g} m: mesh and poses are in different units; bring the mesh"
-            " into the unit of transforms.json (is it in millimetres? then scale its vertices by 0.001)"
+            f"{found}, but the cameras span {cameras:.3g} m: mesh and poses are in different units{likely} scale the vertices of"
+            f" the mesh by {by}"
         )
     size = diagonal if 2 * most > diagonal else most
     across = {name: size / metres * factor for name, factor in METRES.items()}

@@ -137,7 +137,14 @@ def _words(found: Registration, moved: float, plain: bool) -> list[str]:
         f" it by {found.evidence:.1f} standard errors, {found.needed:.1f} are needed"
     )
     if not found.accepted:
-        return [f"registration: poses and intrinsics are taken as given. Moved by {moved:.1f} pixels, {numbers}: no clear gain"]
-    common = f" and the focal length multiplied by {found.focal:.4f}" if plain else ""
+        return [
+            f"registration: poses and focal length are taken as given, because moving them shows no clear gain (by {moved:.1f}"
+            f" pixels, {numbers})"
+        ]
+    off = abs(found.focal - 1)
+    lens = "" if not plain else f"; the focal length was {off:.1%} too {'long' if found.focal < 1 else 'short'}"
     how = "each for itself" if found.each else "all alike"
-    return [f"registration: photographs were moved by {moved:.1f} pixels (median), {how}{common}: {numbers}"]
+    return [
+        f"registration: the photographs lay beside the mesh by {moved:.1f} pixels (median), which is corrected, {how}{lens}"
+        f" ({numbers})"
+    ]
