@@ -234,7 +234,9 @@ def test_nothing_is_green_next_to_a_shining_table_or_a_wrong_rendering(numbers, 
 
 
 @given(
-    st.sampled_from([name for name in LIMITS if name not in ("edges", "rerendering", "rival", "lost")]), st.floats(0, 5), st.floats(0, 5)
+    st.sampled_from([name for name in LIMITS if name not in ("edges", "rerendering", "rival", "lost")]),
+    st.floats(0, 5),
+    st.floats(0, 5),
 )
 def test_worse_evidence_never_brightens_a_light(name, one, other):
     limit = LIMITS[name]
