@@ -142,7 +142,11 @@ def _write_plan(scene: str, quality: str) -> None:
     from workflow.runtime import forecast
 
     links.check_folder(f"plan/{scene}")
-    plan = StageReader(Path("results") / scene / "plan", "plan", scene).json("plan.json")["plan"]
+    from workflow.report.evidence import of_geometry
+    from workflow.report.verdict import Evidence, foreseen
+
+    document = StageReader(Path("results") / scene / "plan", "plan", scene).json("plan.json")
+    plan, probes = document["plan"], document.get("probes") or {}
     cost = forecast.together(COSTLY, scene, quality)
     text = plan_text(scene, quality, [with_expectation(item, cost) for item in plan])
     write_atomically(Path("plan") / scene / "plan.yaml", lambda path: path.write_text(text))
@@ -150,8 +154,17 @@ def _write_plan(scene: str, quality: str) -> None:
     tests = int((capture.table("cameras.parquet")["split"] == "test").sum())
     kept = f", {tests} of them kept for testing" if tests else ""
     counts = f"{capture.rows('cameras.parquet')} photographs{kept}; {capture.rows('faces.parquet')} faces"
-    read = [counts, *capture.json("capture.json")["notes"]]
-    for title, lines in (("what was read", read), (f"what {scene} requires", plan_sentences(plan))):
+    facts, found = capture.json("capture.json"), Path("results") / scene / "reconstruction"
+    alone = StageReader(found, "reconstruction", scene).json("reconstruction.json") if facts["source"] == "photographs" else {}
+    known = of_geometry(
+        facts, capture.rows("cameras.parquet"), alone, probes.get("escape_share") or {}, probes.get("photographed_share")
+    )
+    told = (
+        ("what was read", [counts, *facts["notes"]]),
+        (f"what {scene} requires", plan_sentences(plan)),
+        ("what the report will say of photographs and mesh", foreseen(Evidence(**known))),
+    )
+    for title, lines in told:
         print("\n".join([f"{title}:", *(f"  {line}" for line in lines)]))
     print(f"all of it, with numbers and what is expected: plan/{scene}/plan.yaml")
 

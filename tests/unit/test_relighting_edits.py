@@ -5,6 +5,8 @@ import json
 import os
 import shutil
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -839,6 +841,18 @@ def test_environment_map_as_a_lamp(toy, tmp_path):
     assert not none[8].any()
 
 
+def test_photographs_that_were_left_out_are_known_by_why(tmp_path, monkeypatch):
+    from workflow.relighting.check import _left_out
+
+    monkeypatch.chdir(tmp_path)
+    Path("results/own/reconstruction").mkdir(parents=True)
+    Path("results/own/reconstruction/reconstruction.json").write_text('{"left_out": {"IMG_1.JPG": "alone"}}')
+    facts = {"source": "photographs", "dropped_views": {"b": "it sees nothing"}, "left_out_views": {"c": "blurred"}}
+    own = {"b": "it sees nothing", "c": "blurred"}
+    assert _left_out(SimpleNamespace(facts=facts), "own") == {"IMG_1": "alone", **own}
+    assert _left_out(SimpleNamespace(facts=facts | {"source": "folder"}), "own") == own
+
+
 def test_what_is_known_before_the_jobs_is_told_before_them(toy, monkeypatch):
     """The check that runs while Snakemake plans: it reads finished stages alone."""
     from workflow.relighting import check
@@ -854,6 +868,9 @@ def test_what_is_known_before_the_jobs_is_told_before_them(toy, monkeypatch):
     named(told(materials={"wals": {"metallic": 0}}), "config/scenes/toy.yaml", "relight.materials", "a", "'wals'", "'walls'")
     named(told(lamps={"lmap": 0}), "relight.lamps", "'lmap'", "'lamp'")
     named(told(camera={"views": ["v7"]}), "relight.camera.views", "v7", "v0, v1")
+    with monkeypatch.context() as patched:
+        patched.setattr(check, "_left_out", lambda *_: {"v7": "blurred"})
+        named(told(camera={"views": ["v7"]}), "v7", "left out", "blurred", "v0, v1")
     far = {"position": [90, 0, 0], "look_at": [0, 0, 0]}
     several = told(lamps={"lmap": 0, "walls": 0}, materials={"wals": {"metallic": 0}}, camera={"poses": [far]}).splitlines()
     assert [line.split(" of a: ")[0] for line in several] == [
@@ -872,8 +889,6 @@ def test_mistakes_are_blamed_on_the_plan_that_lists_them():
 
 
 def test_held_out_photographs_lend_their_camera_but_not_their_exposure(studio):
-    from types import SimpleNamespace
-
     from workflow.relighting.camera import photograph_exposure, plan_flight
 
     views = [replace(view, split="test" if view.name == "v1" else "train") for view in studio.capture.views]

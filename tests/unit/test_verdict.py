@@ -14,8 +14,21 @@ from iif_core.evaluation.light import dark_where_saturated
 from workflow.decisions import materials
 from workflow.report import calibration, evidence, wording
 from workflow.report.emitters import lamp_power
-from workflow.report.evidence import BRIGHT, SHOWN, doubtful_area
-from workflow.report.verdict import AMBER, GREEN, LIGHT_OF, LIMITS, MEANS, NOTED, ORDER, RED, Evidence, judge, limits_table
+from workflow.report.evidence import BRIGHT, SHOWN, doubtful_area, of_geometry
+from workflow.report.verdict import (
+    AMBER,
+    GREEN,
+    LIGHT_OF,
+    LIMITS,
+    MEANS,
+    NOTED,
+    ORDER,
+    RED,
+    Evidence,
+    foreseen,
+    judge,
+    limits_table,
+)
 
 GOOD = Evidence(
     escape=0.0, escape_camera=0.0, depth=0.004, edges=0.45, agreement=0.92, photographs=24, photographed=0.95, stability=0.9,
@@ -57,6 +70,18 @@ def test_a_level_that_is_fixed_is_not_doubted_for_light_that_was_raised_before(l
     """The patch then sets the level, whatever was raised."""
     assert changed(raised=1.4)["scale"] == AMBER and changed(raised=1.4, level=level)["scale"] == GREEN
     assert not any("albedos" in f.text for f in judge(dataclasses.replace(GOOD, raised=1.4, level=level)).lights[3].findings)
+
+
+def test_the_plan_says_what_the_report_will_say_of_photographs_and_mesh():
+    facts = {"alignment": {"edge_correlation": 0.4}, "left_out_views": {"a": "blurred"}, "notes": []}
+    known = of_geometry(facts, 19, {}, {"primary": 0.05, "secondary": 0.64}, 0.9)
+    word, first = foreseen(Evidence(**known))
+    finding = judge(Evidence(**known)).lights[0].findings[0]
+    assert word == "geometry: poor" and first == f"{finding.text}. To do: {finding.remedy}" and "64.0 %" in first
+    assert known["lost"] == 1 and foreseen(Evidence(**{**known, "escape": 0.02})) == ["geometry: good"]
+    alone = of_geometry(facts, 8, {"depth_share": [0.2, 0.4], "left_out": {"b": "", "c": ""}, "planes": []}, {}, None)
+    assert (alone["lost"], alone["depth"], alone["escape"]) == (3, None, None) and alone["confirmed"] == pytest.approx(0.3)
+    assert any("between them" in line for line in foreseen(Evidence(**alone)))
 
 
 def test_a_hopeless_capture_says_so_first():

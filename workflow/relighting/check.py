@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from iif_core.errors import InputError
+from workflow.artifacts.files import facts_in
 from workflow.relighting.inserts import light_of, load_insert
 from workflow.relighting.inventory import Inventory, Problems, check_places, check_views
 from workflow.relighting.video import require_codec
@@ -43,6 +44,14 @@ def blamed_on_plan(scene: str) -> Iterator[None]:
         raise InputError("\n".join(f"{where}: {line}" for line in str(error).splitlines())) from None
 
 
+def _left_out(capture: CaptureReader, scene: str) -> dict[str, str]:
+    """Return the photographs that are no views -> why."""
+    of_photographs = capture.facts.get("source") == "photographs"
+    alone = facts_in(Path("results") / scene / "reconstruction/reconstruction.json") if of_photographs else {}
+    placed_nowhere = {Path(name).stem: why for name, why in alone.get("left_out", {}).items()}
+    return placed_nowhere | capture.facts.get("dropped_views", {}) | capture.facts.get("left_out_views", {})
+
+
 def _check(entries: list[dict[str, Any]], scene: str, quality: str, names: dict[str, str]) -> None:
     capture, segmentation, emission = (finished(stage, scene, quality) for stage in ("capture", "segmentation", "emission"))
     photographed = CaptureReader(capture) if capture is not None else None
@@ -50,6 +59,7 @@ def _check(entries: list[dict[str, Any]], scene: str, quality: str, names: dict[
     if segmentation is not None and emission is not None:
         inventory = Inventory.read(segmentation, emission, names)
     vertices = photographed.mesh()[0] if photographed else None
+    left_out = _left_out(photographed, scene) if photographed else {}
     problems = Problems()
     for entry in entries:
         with problems.caught():
@@ -60,7 +70,7 @@ def _check(entries: list[dict[str, Any]], scene: str, quality: str, names: dict[
                 light_of(load_insert(Path(insert["file"])), insert)
         if photographed:
             with problems.caught():
-                check_views(entry, [view.name for view in photographed])
+                check_views(entry, [view.name for view in photographed], left_out)
             with problems.caught():
                 check_places(entry, vertices.min(0), vertices.max(0))
         if inventory:

@@ -220,8 +220,8 @@ def check_places(entry: dict[str, Any], low: Array, high: Array) -> None:
     problems.tell()
 
 
-def check_views(entry: dict[str, Any], names: Iterable[str]) -> None:
-    """Check the views that a dumped relighting names.
+def check_views(entry: dict[str, Any], names: Iterable[str], left_out: Mapping[str, str] | None = None) -> None:
+    """Check the views that a dumped relighting names; `left_out`: photograph that is no view -> why.
 
     Raises:
         InputError: one does not exist.
@@ -229,7 +229,8 @@ def check_views(entry: dict[str, Any], names: Iterable[str]) -> None:
     known = list(names)
     for name in entry["camera"]["views"]:
         if name not in known:
+            why = f", a photograph that was left out ({left_out[name]})" if left_out and name in left_out else ""
             raise InputError(
-                f"relight.camera.views of {entry['name']}: found {name}; the views are {', '.join(known[:8])}"
-                f"{f' and {len(known) - 8} more' if len(known) > 8 else ''}.{did_you_mean(name, known)}"
+                f"relight.camera.views of {entry['name']}: found {name}{why}; the views are {', '.join(known[:8])}"
+                f"{f' and {len(known) - 8} more' if len(known) > 8 else ''}.{'' if why else did_you_mean(name, known)}"
             )

@@ -32,9 +32,7 @@ def evidence_of(scene: Reported) -> Evidence:
     """Return what is known about a result."""
     capture, recovered, means = scene.capture, scene.recovered, scene.summary["means"]
     emission, affines = scene.document("emission"), scene.document("affines")
-    alignment, registration = capture.facts.get("alignment") or {}, capture.facts.get("registration") or {}
-    agreement = [view["agreement"] for view in registration.get("views", {}).values() if view.get("agreement")]
-    escape, scale = emission.get("escape_share") or {}, affines.get("scale") or {}
+    scale = affines.get("scale") or {}
     cache = [
         decision["value"]
         for decision in scene.document("shading").get("plan", [])
@@ -49,7 +47,7 @@ def evidence_of(scene: Reported) -> Evidence:
     unlikely, power = lamps & (probability >= 0) & (probability < DOUBTFUL), lamp_power(emitters)
     doubted = dict(zip(emitters["name"][unlikely].tolist(), probability[unlikely].tolist(), strict=True))
     alone = scene.document("reconstruction") if "reconstruction" in scene.readers else {}
-    unplaced = len(alone.get("left_out", ()))
+    photographed = float(cache[-1]) if cache else scene.document("plan").get("probes", {}).get("photographed_share")
     scored = psnr_of_views(scene.readers["metrics"].table("metrics.parquet"))
     worst = min(scored, key=lambda view: scored[view], default="")
     aside = [scored[view.name] for view in scene.capture.views if view.split == "test" and view.name in scored]
@@ -64,19 +62,7 @@ def evidence_of(scene: Reported) -> Evidence:
         return None if square is None else float(-10 * np.log10(max(square, 1e-12)))
 
     return Evidence(
-        escape=escape.get("secondary"),
-        escape_camera=escape.get("primary"),
-        # The depth of photographs alone is what their mesh was made of.
-        depth=None if alone else alignment.get("depth_median_disagreement"),
-        edges=alignment.get("edge_correlation"),
-        edges_warn=any("may not be aligned" in str(note) for note in capture.facts.get("notes", [])),
-        agreement=float(np.median(agreement)) if agreement else None,
-        confirmed=float(np.mean(alone["depth_share"])) if alone else None,
-        built=sum(float(side["added_m2"]) for side in alone.get("planes", ())),
-        photographs=len(capture.views),
-        added=bool(capture.facts.get("added_faces")),
-        lost=sum(map(len, (capture.facts.get("dropped_views") or (), capture.facts.get("left_out_views") or ()))) + unplaced,
-        photographed=float(cache[-1]) if cache else scene.document("plan").get("probes", {}).get("photographed_share"),
+        **of_geometry(capture.facts, len(capture.views), alone, emission.get("escape_share") or {}, photographed),
         stability=scene.document("segmentation").get("stability"),
         lamps=len(set(emitters["name"][lamps].tolist())),
         unlikely=[f"{name} ({percent(p)})" for name, p in doubted.items()],
@@ -107,6 +93,42 @@ def evidence_of(scene: Reported) -> Evidence:
         discrepancy=(affines.get("level_errors") or {}).get("normalised_discrepancy"),
         warnings=[(stage, says) for stage in NUMERICS for says in numerics.warnings([(stage, scene.document(stage))])],
     )
+
+
+def of_geometry(
+    capture: Mapping[str, Any],
+    photographs: int,
+    alone: Mapping[str, Any],
+    escape: Mapping[str, float],
+    photographed: float | None,
+) -> dict[str, Any]:
+    """Return the evidence on the geometry, which stage `plan` has already.
+
+    Args:
+        capture: capture.json.
+        photographs: number of those that are there.
+        alone: reconstruction.json of photographs alone; else empty.
+        escape: shares of the rays from cameras (`primary`) and from surface (`secondary`) that leave the mesh.
+        photographed: share of the surface met by rays from surface that photographs show.
+    """
+    alignment, registration = capture.get("alignment") or {}, capture.get("registration") or {}
+    agreement = [view["agreement"] for view in registration.get("views", {}).values() if view.get("agreement")]
+    left_out = [capture.get(key) or () for key in ("dropped_views", "left_out_views")] + [alone.get("left_out", ())]
+    return {
+        "escape": escape.get("secondary"),
+        "escape_camera": escape.get("primary"),
+        # The depth of photographs alone is what their mesh was made of.
+        "depth": None if alone else alignment.get("depth_median_disagreement"),
+        "edges": alignment.get("edge_correlation"),
+        "edges_warn": any("may not be aligned" in str(note) for note in capture.get("notes", [])),
+        "agreement": float(np.median(agreement)) if agreement else None,
+        "confirmed": float(np.mean(alone["depth_share"])) if alone else None,
+        "built": sum(float(side["added_m2"]) for side in alone.get("planes", ())),
+        "photographs": photographs,
+        "added": bool(capture.get("added_faces")),
+        "lost": sum(map(len, left_out)),
+        "photographed": photographed,
+    }
 
 
 def _missed(saturated: Mapping[str, Any]) -> dict[str, Any]:

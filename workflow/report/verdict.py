@@ -267,6 +267,14 @@ def judge(e: Evidence) -> Verdict:
     return Verdict(_sentence(lights, e), max((light.level for light in lights), key=ORDER.index), lights)
 
 
+def foreseen(e: Evidence) -> list[str]:
+    """Return what the geometry alone, which is known before anything else, says of a result: a word, then each finding that is
+    not good, with what helps."""
+    light = _geometry(e)
+    bad = [finding for finding in light.findings if finding.level in (AMBER, RED)]
+    return [f"geometry: {light.word}", *(f"{finding.text}. To do: {finding.remedy}" for finding in bad)]
+
+
 def _doubts(e: Evidence) -> dict[str, str]:
     """Return light -> what is wrong with it that speaks against every light. Photographs, mesh and light go together: where one
     of them is wrong, any of them may be, and none is green."""
@@ -385,8 +393,8 @@ def _geometry(e: Evidence) -> Light:
             AMBER,
             f"Cameras and mesh were found from the photographs alone: {percent(e.confirmed)} of their pixels have a depth that"
             f" several photographs confirm, and {e.built:.0f} m² of flat sides were built where none shows any",
-            "Look at the picture of cameras and mesh below, and at room.html from above: what has no texture may have holes."
-            " Take more photographs of what is torn, or use the mesh of a scan (docs/guide/programs.md)",
+            "Look at the picture of cameras and mesh (reconstruction/overview.png), and at room.html from above: what has no"
+            " texture may have holes. Take more photographs of what is torn, or use the mesh of a scan (docs/guide/programs.md)",
         )  # fmt: skip
     made_up = Finding(
         AMBER, "Sides were made up around the scan (source.close), whose colour 0 photographs show",
@@ -429,7 +437,8 @@ def _geometry(e: Evidence) -> Light:
             _finding(
                 "lost", lost if e.photographs else None,
                 f"{e.lost} of {e.photographs + e.lost} photographs were left out ({{}})",
-                "Take them again, sharper and with poses; the notes say why each was left out", ".0%",
+                "Take more photographs between them and the others; the notes say which were left out, and why"
+                if alone else "Take them again, sharper and with poses; the notes say why each was left out", ".0%",
             ),
         ],
     )  # fmt: skip
