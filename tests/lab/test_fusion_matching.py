@@ -76,7 +76,7 @@ def test_polishing_lowers_the_papers_loss():
     problem, _ = simulated()
     problem = replace(problem, weight=None)
     start = solve_direct(problem, FusionOptions(final_temperature=0))
-    one, many = (solve_distribution(problem, FusionOptions(final_temperature=0), polish=n) for n in (1, 40))
+    one, many = (solve_distribution(problem, FusionOptions(final_temperature=0), polish=n) for n in (1, 15))
 
     def judged(result):
         loss = loss_of_result(problem, result)
