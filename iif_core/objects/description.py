@@ -157,20 +157,22 @@ class _Sides:
         self.centre = np.stack([np.bincount(label, area * middle[:, i], count) for i in range(3)], 1) / total[:, None]
 
     def walls(self, albedo: NDArray, known: NDArray, high: float) -> list[int]:
-        """Return the objects that make up walls: in one plane, of one colour, with hardly anything behind them.
+        """Return the objects that make up walls together: in one plane, of one colour, with hardly anything behind them. What
+        is a wall by itself needs no others, and panels of a door are none.
 
         Args:
-            albedo, known: (objects, 3) linear Rec.709, and whether it is known; what nobody has seen joins any wall.
+            albedo, known: (objects, 3) linear Rec.709, and whether it is known.
             high: metres that a wall reaches over.
         """
         lab = lab_from_linear(np.clip(np.where(known[:, None], albedo, 0), 0, 1))
-        left, out = self.flat.copy(), []
+        alone = (self.size >= WALL) & (self.high - self.low >= high)
+        left, out = self.flat & known & ~alone, []
         for seed in np.argsort(-self.size, kind="stable"):
             if not left[seed]:
                 continue
             axis, at = self.axis[seed], self.axis[seed] @ self.centre[seed]
             near = left & (np.abs(self.axis @ axis) >= PARALLEL) & (np.abs(self.centre @ axis - at) <= PLANE)
-            alike = near & (~known | ~known[seed] | (np.linalg.norm(lab - lab[seed], axis=1) <= ALIKE))
+            alike = near & (np.linalg.norm(lab - lab[seed], axis=1) <= ALIKE)
             offset = self.middle @ axis - at
             behind = min(self.area[offset > BEYOND].sum(), self.area[offset < -BEYOND].sum())
             reach = self.high[alike].max() - self.low[alike].min()

@@ -85,6 +85,14 @@ def test_pieces_of_a_wall_are_a_wall_together_and_other_flat_pieces_are_fronts(m
         assert all("wall" in name for name in names[6:])
 
 
+def test_panels_beside_a_wall_are_none_and_neither_is_what_nobody_saw():
+    door, panel = (0.0, (0.0, 1.0), (0.0, 2.1)), (0.02, (1.0, 1.6), (0.3, 2.2))
+    vertices, faces, label = built_up(*ROOM, door, panel, *STRIPS)
+    names = described(label, vertices, faces, np.tile(GREY, (8, 1)), np.arange(8) < 4, (0, 0, 1))
+    assert "wall" in names[2] and "front" in names[3]
+    assert all(name.startswith("unseen") and "front" in name for name in names[4:])
+
+
 def test_low_pieces_and_small_ones_are_no_wall():
     low = [(0.0, (i, i + 1), (0.0, 0.8)) for i in range(4)]
     small = [(4.0, (0.0, 0.1), (0.0, 0.1))]
