@@ -139,12 +139,11 @@ def _write_plan(scene: str, quality: str) -> None:
     from workflow.decisions.expected import STAGES as COSTLY
     from workflow.decisions.expected import with_expectation
     from workflow.decisions.record import plan_sentences, plan_text
+    from workflow.report.evidence import of_geometry
+    from workflow.report.verdict import Evidence, foreseen
     from workflow.runtime import forecast
 
     links.check_folder(f"plan/{scene}")
-    from workflow.report.evidence import of_geometry
-    from workflow.report.verdict import Evidence, foreseen
-
     document = StageReader(Path("results") / scene / "plan", "plan", scene).json("plan.json")
     plan, probes = document["plan"], document.get("probes") or {}
     cost = forecast.together(COSTLY, scene, quality)

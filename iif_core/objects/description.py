@@ -100,6 +100,7 @@ def described(
     tall = max(float(top - bottom), 1e-12)
 
     known = np.asarray(seen, bool) & np.isfinite(np.asarray(albedo, np.float64)).all(1)
+    wall = upright & (size >= WALL) & (high - low >= HIGH * tall)
     sides = _Sides(label, normal, area, vertices[faces].mean(1), upright, low, high)
     kinds = []
     for i in range(count):
@@ -109,9 +110,8 @@ def described(
             ceiling = at_end and place[i] >= top - NEAR * tall
             kinds.append("floor" if floor else "ceiling" if ceiling else "top")
         else:
-            wall = upright[i] and size[i] >= WALL and high[i] - low[i] >= HIGH * tall
-            kinds.append("wall" if wall else "front" if sides.flat[i] and size[i] >= FRONT else "piece")
-    for i in sides.walls(np.asarray(albedo, np.float64), known, HIGH * tall):
+            kinds.append("wall" if wall[i] else "front" if sides.flat[i] and size[i] >= FRONT else "piece")
+    for i in sides.walls(np.asarray(albedo, np.float64), known & ~wall, HIGH * tall):
         kinds[i] = "wall"
     added = np.zeros(count, bool) if built is None else np.asarray(built, bool)
     colours = ["added" if a else colour_name(c) if s else "unseen" for a, c, s in zip(added, albedo, known, strict=True)]
@@ -144,7 +144,9 @@ class _Sides:
         flat: (objects,) bool, they are upright and their normals are alike.
     """
 
-    def __init__(self, label, normal, area, middle, upright, low, high):
+    def __init__(
+        self, label: NDArray, normal: NDArray, area: NDArray, middle: NDArray, upright: NDArray, low: NDArray, high: NDArray
+    ):
         count = len(upright)
         self.size, self.low, self.high = np.bincount(label, area, count), low, high
         self.middle, self.area = middle, area
@@ -156,17 +158,17 @@ class _Sides:
         self.flat = upright & (values[:, -1] >= FLAT)
         self.centre = np.stack([np.bincount(label, area * middle[:, i], count) for i in range(3)], 1) / total[:, None]
 
-    def walls(self, albedo: NDArray, known: NDArray, high: float) -> list[int]:
-        """Return the objects that make up walls together: in one plane, of one colour, with hardly anything behind them. What
-        is a wall by itself needs no others, and panels of a door are none.
+    def walls(self, albedo: NDArray, asked: NDArray, high: float) -> list[int]:
+        """Return the objects that make up walls together: in one plane, of one colour, with hardly anything behind them.
 
         Args:
-            albedo, known: (objects, 3) linear Rec.709, and whether it is known.
+            albedo: (objects, 3) linear Rec.709.
+            asked: (objects,) bool, which may join: of known colour, and no wall by themselves. Such a wall needs no others, and
+                panels of a door in its plane are none.
             high: metres that a wall reaches over.
         """
-        lab = lab_from_linear(np.clip(np.where(known[:, None], albedo, 0), 0, 1))
-        alone = (self.size >= WALL) & (self.high - self.low >= high)
-        left, out = self.flat & known & ~alone, []
+        lab = lab_from_linear(np.clip(np.where(asked[:, None], albedo, 0), 0, 1))
+        left, out = self.flat & asked, []
         for seed in np.argsort(-self.size, kind="stable"):
             if not left[seed]:
                 continue

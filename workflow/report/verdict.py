@@ -627,17 +627,18 @@ def _scale(e: Evidence) -> Light:
         )
         fixed = fixed or Finding(AMBER, "The level of light and albedo is not known: 0 measurements of it", patch)
     moved = max(e.light_scale, 1 / e.light_scale) if e.light_scale > 0 else float("inf")
+    raised = None  # what fixes the level does so whatever was raised before
+    if e.level not in FIXED:
+        raised = Finding(GREEN, "No light had to be added to keep albedos below 1") if e.raised <= 1 else _finding(
+            "raised", e.raised, "All light was raised by a factor of {}, so that albedos stay below 1",
+            "Light is missing: photograph every lamp and window and close the mesh, or fix the level by a white patch", ".2f",
+        )  # fmt: skip
     return _made(
         "scale",
         "How bright are albedo and light together?",
         [
             fixed,
-            _finding(
-                "raised", e.raised, "All light was raised by a factor of {}, so that albedos stay below 1",
-                "Light is missing: photograph every lamp and window and close the mesh, or fix the level by a white patch", ".2f",
-            ) if not e.raised <= 1 and e.level not in FIXED else None if e.level in FIXED else Finding(
-                GREEN, "No light had to be added to keep albedos below 1"
-            ),
+            raised,
             _finding(
                 "light_scale", moved, "The light that was found and the albedo that was predicted disagree by a factor of {}"
                 f" (the albedos were divided by {e.light_scale:.3g})", patch, ".2f",

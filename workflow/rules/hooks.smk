@@ -63,8 +63,8 @@ def damages():
 
 
 def tell_results():
-    """Say whether scenes reached the score that was asked for and, after the last line of Snakemake, what their reports say and where to look: the pages of
-    the scenes that were made, or of the batch, and the contact sheets of relightings."""
+    """Say whether scenes reached the score that was asked for and, after the last line of Snakemake, what their reports
+    say and where to look: the pages of the scenes that were made, or of the batch, and the contact sheets of relightings."""
     if not workflow.is_main_process:
         return
     for line in choose.reached(REQUEST, CHOSEN):
